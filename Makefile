@@ -1,0 +1,33 @@
+# `make demo` and `make test` work on a bare machine with Python 3.11 or newer: the environment is made when missing.
+PYTHON ?= python3
+TEST_WORKERS ?= 2
+BIN := .venv/bin
+READY := .venv/.ready
+
+.PHONY: demo test lint types bench clean
+
+demo: $(READY)
+	$(BIN)/gyromodel demo
+
+test: $(READY)
+	$(BIN)/pytest -n $(TEST_WORKERS)
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(READY)
+	$(BIN)/pyright
+
+bench: $(READY)
+	$(BIN)/python -m benchmarks
+
+clean:
+	rm -rf .venv .cache build dist gyromodel-demo
+
+$(READY): pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	  echo "gyromodel needs Python 3.11 or newer, and '$(PYTHON)' is not: name one, e.g. make PYTHON=python3.12" >&2; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	touch $@

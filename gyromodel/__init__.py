@@ -1,0 +1,70 @@
+"""What a gyro simulation gets wrong, why, and the model that gets it right.
+
+Importing this package switches JAX to float64, here and nowhere else. Names are imported when first used, so that
+the package itself, and commands that compute nothing, load neither JAX nor pandas.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gyromodel.campaign import Campaign as Campaign
+    from gyromodel.campaign import CampaignError as CampaignError
+    from gyromodel.diagnose import Diagnosis as Diagnosis
+    from gyromodel.diagnose import diagnose as diagnose
+    from gyromodel.effects import CATALOGUE as CATALOGUE
+    from gyromodel.effects import Effect as Effect
+    from gyromodel.estimate import Estimate as Estimate
+    from gyromodel.estimate import fit as fit
+    from gyromodel.files import read_campaign as read_campaign
+    from gyromodel.files import write_campaign as write_campaign
+    from gyromodel.model import GyroModel as GyroModel
+    from gyromodel.model import model_from_effects as model_from_effects
+    from gyromodel.model_files import read_model as read_model
+    from gyromodel.model_files import write_model as write_model
+    from gyromodel.report import write_report as write_report
+    from gyromodel.units import UnitError as UnitError
+
+__version__ = "0.1.0"
+
+_MODULE_OF = {
+    "CATALOGUE": "effects",
+    "Campaign": "campaign",
+    "CampaignError": "campaign",
+    "Diagnosis": "diagnose",
+    "Effect": "effects",
+    "Estimate": "estimate",
+    "GyroModel": "model",
+    "UnitError": "units",
+    "diagnose": "diagnose",
+    "fit": "estimate",
+    "model_from_effects": "model",
+    "read_campaign": "files",
+    "read_model": "model_files",
+    "write_campaign": "files",
+    "write_model": "model_files",
+    "write_report": "report",
+}
+__all__ = ["__version__", *_MODULE_OF]  # pyright: ignore[reportUnsupportedDunderAll]
+
+# JAX reads the variable when it is imported; a process that imported JAX before this package is switched directly.
+if "jax" in sys.modules:
+    sys.modules["jax"].config.update("jax_enable_x64", True)
+else:
+    os.environ["JAX_ENABLE_X64"] = "1"
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'gyromodel' has no attribute {name!r}")
+    value = getattr(import_module(f"gyromodel.{_MODULE_OF[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

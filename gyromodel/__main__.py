@@ -1,0 +1,5 @@
+"""`python -m gyromodel` is the command line."""
+
+from gyromodel.cli import main
+
+main()

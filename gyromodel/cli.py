@@ -1,0 +1,317 @@
+"""The command line: parse, call, print. Commands import what they compute with, so that help stays fast."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from io import TextIOWrapper
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+import gyromodel
+from gyromodel._atomic import write_text
+
+if TYPE_CHECKING:
+    from gyromodel.campaign import Campaign
+    from gyromodel.diagnose import Diagnosis
+
+DATA = Path(__file__).parent / "data"
+REPORTS = ("report.html", "diagnosis.json", "model.yaml")
+# Errors that mean "the data or the model cannot answer", by the module that defines them.
+_REFUSALS = {
+    "gyromodel.campaign": "CampaignError",
+    "gyromodel.units": "UnitError",
+    "gyromodel.model": "ModelError",
+    "gyromodel.estimate": "EstimateError",
+}
+
+# Help without rich: it loads in half the time.
+app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
+
+Campaigns = Annotated[list[Path], typer.Argument(metavar="CAMPAIGN", help="Campaign files of one gyro unit.")]
+ModelFile = Annotated[Path, typer.Option("--model", metavar="M.yaml", help="The model to start from.")]
+Folder = Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for the results; made if missing.")]
+Axis = Annotated[
+    Literal["x", "y", "z"] | None, typer.Option("--axis", help="Axis of a three-axis campaign.", show_default=False)
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the machine-readable result.")]
+CampaignFile = Annotated[
+    Path, typer.Option("--output", "-o", metavar="FILE", help="Campaign to write; its suffix says the kind.")
+]
+Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of the random draws.")]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line; ends with the exit status of the contract: 0 done, 1 cannot answer, 2 wrong usage."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")  # an equation's ε must not stop a terminal that lacks it
+    try:
+        typer.main.get_command(app)(args=arguments, prog_name="gyromodel")
+    except Exception as error:
+        if os.environ.get("GYROMODEL_DEBUG") == "1":
+            raise
+        print(f"gyromodel: {_sentence(error)}", file=sys.stderr)
+        sys.exit(1)
+
+
+def _sentence(error: Exception) -> str:
+    refusals = tuple(getattr(sys.modules[m], name) for m, name in _REFUSALS.items() if m in sys.modules)
+    if isinstance(error, refusals):
+        return str(error)
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    found = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+    return f"internal error ({found}); please report it with the output under GYROMODEL_DEBUG=1"
+
+
+def _print_version(wanted: bool) -> bool:
+    if wanted:
+        print(f"gyromodel {gyromodel.__version__}")
+        raise typer.Exit
+    return wanted
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Find what a gyro simulation gets wrong, name the cause, and extend the model."""
+
+
+@app.command()
+def demo(as_json: AsJson = False) -> None:
+    """Run the whole chain on embedded data; writes ./gyromodel-demo."""
+    from gyromodel.files import write_campaign
+    from gyromodel.model import simulate as simulate_campaign
+    from gyromodel.model_files import read_model
+    from gyromodel.plan import read_plan
+
+    table, thermal = Path("gyromodel-demo"), Path("gyromodel-demo", "fiber_optic")
+    copies = {
+        "ring_laser_table.csv": table / "campaign.csv",
+        "ring_laser_model.yaml": table / "simulation.yaml",
+        "fiber_optic_plan.yaml": thermal / "plan.yaml",
+        "fiber_optic_truth.yaml": thermal / "truth.yaml",
+        "fiber_optic_model.yaml": thermal / "simulation.yaml",
+    }
+    for source, target in copies.items():
+        write_text(target, (DATA / source).read_text(encoding="utf-8"))
+    simulated = simulate_campaign(read_model(thermal / "truth.yaml"), read_plan(thermal / "plan.yaml"), seed=0)
+    write_campaign(simulated, thermal / "campaign.csv")
+    titles = {
+        table: "Ring laser gyro on a rate table, published data:",
+        thermal: "Fiber-optic gyro over temperature, simulated from truth.yaml:",
+    }
+    found = {}
+    for folder, title in titles.items():
+        result, verdict = _diagnose([folder / "campaign.csv"], folder / "simulation.yaml", folder)
+        found["ring_laser" if folder is table else "fiber_optic"] = result
+        if not as_json:
+            print(f"{title}\n{verdict}")
+            _print_paths(folder, *REPORTS)
+            print()
+    if as_json:
+        print(_json(found), end="")
+
+
+@app.command()
+def fit(campaigns: Campaigns, model: ModelFile, output: Folder, axis: Axis = None, as_json: AsJson = False) -> None:
+    """Fit a model to the campaigns of one unit, jointly."""
+    _prepare(output, model)
+    from gyromodel.estimate import fit as fit_model
+    from gyromodel.model_files import read_model, write_model
+
+    start, measured = read_model(model), _read(campaigns, axis)
+    with _progress() as progress:
+        estimate = fit_model(measured, start, progress=progress)
+    result = estimate.to_dict()
+    write_model(estimate, output / "model.yaml")
+    write_text(output / "fit.json", _json(result))
+    if as_json:
+        print(_json(result), end="")
+        return
+    from gyromodel.report import with_uncertainty
+
+    rows = [(row.effect, row.name, with_uncertainty(row.value, row.std, row.unit)) for row in estimate.table()]
+    _print_table(("effect", "parameter", "value ± standard uncertainty"), rows)
+    noise = [(name, *(f"{n[k]:.3g}" for k in ("value", "lo", "hi")), n["unit"]) for name, n in result["noise"].items()]
+    print()
+    _print_table(("noise", "value", "95 % from", "to", "unit"), noise)
+    _print_paths(output, "model.yaml", "fit.json")
+
+
+@app.command()
+def diagnose(
+    campaigns: Campaigns,
+    model: ModelFile,
+    output: Folder,
+    axis: Axis = None,
+    calibrate: Annotated[
+        int, typer.Option(min=0, metavar="N", help="Take the threshold from N simulated campaigns with nothing hidden.")
+    ] = 0,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Say what the simulation gets wrong, and why.
+
+    Writes the extended model, the gain measured on data it did not see, and a report.
+    """
+    result, verdict = _diagnose(campaigns, model, output, axis=axis, calibrate=calibrate, seed=seed)
+    if as_json:
+        print(_json(result), end="")
+    else:
+        print(verdict)
+        _print_paths(output, *REPORTS)
+
+
+@app.command()
+def simulate(
+    model: Annotated[Path, typer.Argument(metavar="M.yaml", help="A model with values.")],
+    output: CampaignFile,
+    like: Annotated[Path | None, typer.Option(metavar="CAMPAIGN", help="Take time and covariates from it.")] = None,
+    plan: Annotated[Path | None, typer.Option(metavar="PLAN.yaml", help="Or from a plan.")] = None,
+    axis: Axis = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Compute the campaign that a model predicts, noise included."""
+    pattern_file = like or plan
+    if pattern_file is None or (like and plan):
+        raise typer.BadParameter("give either --like CAMPAIGN or --plan PLAN.yaml", param_hint="--like")
+    _refuse_overwriting(output, [model, pattern_file])
+    from gyromodel.files import read_campaign, write_campaign
+    from gyromodel.model import simulate as simulate_campaign
+    from gyromodel.model_files import read_model
+    from gyromodel.plan import read_plan
+
+    simulated_by = read_model(model)
+    pattern = read_plan(pattern_file) if plan else read_campaign(pattern_file)
+    simulated = simulate_campaign(simulated_by, pattern.axis(axis) if axis else pattern, seed)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    write_campaign(simulated, output)
+    result = {"campaign": str(output), "rows": len(simulated), "seed": seed, "data_hash": simulated.digest()}
+    print(_json(result) if as_json else f"{len(simulated)} samples in {output}\n", end="")
+
+
+@app.command()
+def effects(
+    effect: Annotated[str | None, typer.Argument(metavar="ID", help="One effect, in full.", show_default=False)] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Print the catalogue of effects, or one entry in full."""
+    from dataclasses import asdict
+
+    from gyromodel.declarations import declarations
+
+    catalogue = declarations()
+    if effect is not None and effect not in catalogue:
+        from difflib import get_close_matches
+
+        close = get_close_matches(effect, catalogue, n=3)
+        hint = f"; did you mean {' or '.join(close)}?" if close else "; `gyromodel effects` lists them"
+        raise typer.BadParameter(f"no effect is called {effect}{hint}", param_hint="ID")
+    if as_json:
+        entries = asdict(catalogue[effect]) if effect else [asdict(entry) for entry in catalogue.values()]
+        print(_json(entries), end="")
+    elif effect is None:
+        rows = [(e.id, e.site, ", ".join(e.needs) or "–", e.equation) for e in catalogue.values()]
+        _print_table(("effect", "acts on", "needs", "equation"), rows)
+    else:
+        entry = catalogue[effect]
+        needs = ", ".join(entry.needs) or "no column"
+        print("\n".join(filter(None, [entry.id, entry.equation, entry.details])))
+        print(f"\nacts on  {entry.site}\nneeds    {needs}\ncause    {entry.cause}\ntest     {entry.test}\n")
+        rows = [(p.name, f"{p.typical:g}", p.unit, p.meaning) for p in entry.parameters]
+        _print_table(("parameter", "typical", "unit", "meaning"), rows)
+
+
+def _diagnose(
+    campaigns: Sequence[Path],
+    model: Path,
+    output: Path,
+    *,
+    axis: str | None = None,
+    calibrate: int = 0,
+    seed: int = 0,
+) -> tuple[dict[str, Any], str]:
+    """Diagnose and write the results; what diagnosis.json holds, and the verdict in a sentence."""
+    _prepare(output, model)
+    from gyromodel.diagnose import diagnose as diagnose_campaigns
+    from gyromodel.model_files import read_model, write_model
+    from gyromodel.report import sentence, write_report
+
+    start, measured = read_model(model), _read(campaigns, axis)
+    with _progress() as progress:
+        diagnosis: Diagnosis = diagnose_campaigns(measured, start, calibrate=calibrate, seed=seed, progress=progress)
+    result = diagnosis.to_dict() | {"model": "model.yaml"}
+    write_model(diagnosis.extended, output / "model.yaml")
+    write_text(output / "diagnosis.json", _json(result))
+    write_report(diagnosis, output)
+    return result, sentence(diagnosis)
+
+
+def _read(paths: Sequence[Path], axis: str | None) -> list[Campaign]:
+    from gyromodel.files import read_campaign
+
+    measured = [read_campaign(path) for path in paths]
+    return [campaign.axis(axis) for campaign in measured] if axis else measured
+
+
+def _prepare(folder: Path, model: Path) -> None:
+    """Refuse or make the folder for results before the work, so that a wrong place costs no time."""
+    _refuse_overwriting(folder / "model.yaml", [model])
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+def _refuse_overwriting(target: Path, inputs: Sequence[Path]) -> None:
+    for path in inputs:
+        if target.exists() and path.exists() and target.samefile(path):
+            raise typer.BadParameter(f"would overwrite {path}, which is read: name another", param_hint="--output")
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[str, float], None] | None]:
+    """A callback (what is being done, share done) that draws a bar on standard error when that is a terminal."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=1.0)
+        yield lambda text, share: bar.update(task, description=text, completed=share)
+
+
+def _json(value: Any) -> str:
+    return json.dumps(_plain(value), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _plain(value: Any) -> Any:
+    """The value as JSON can hold it: arrays as lists, and null where there is no finite number."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
+    for row in [header, *rows]:
+        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+
+
+def _print_paths(folder: Path, *names: str) -> None:
+    print("\n" + "\n".join(str(folder / name) for name in names))

@@ -1,0 +1,100 @@
+"""The effect catalogue as plain data, read from the source text of `gyromodel/effects` without importing JAX.
+
+An effect declares everything a reader wants to know as literals (class attributes, the docstring, `parameter` calls),
+so listing the catalogue needs a parser only. The tests hold it equal to the imported catalogue.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+FOLDER = Path(__file__).parent / "effects"
+
+
+@dataclass(frozen=True)
+class ParameterDeclaration:
+    """One parameter: its unit in files, usual size in that unit, and meaning."""
+
+    name: str
+    unit: str
+    typical: float
+    meaning: str
+    linear: bool = True
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """One catalogue entry; `equation` is the first line of the docstring and `details` the rest."""
+
+    id: str
+    site: str
+    equation: str
+    details: str
+    parameters: tuple[ParameterDeclaration, ...]
+    needs: tuple[str, ...]
+    cause: str
+    test: str
+
+
+def declarations() -> dict[str, Declaration]:
+    """The catalogue by effect id, in the order of the source files."""
+    classes = {}
+    for path in sorted(FOLDER.glob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"), str(path))
+        classes |= {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+    found = [_declaration(node, classes) for node in classes.values() if "id" in _literals(node)]
+    return {entry.id: entry for entry in found}
+
+
+def _declaration(node: ast.ClassDef, classes: dict[str, ast.ClassDef]) -> Declaration:
+    literals: dict[str, Any] = {}
+    parameters: dict[str, ParameterDeclaration] = {}
+    for cls in _ancestry(node, classes):
+        literals |= _literals(cls)
+        parameters |= _parameters(cls)
+    equation, _, details = inspect.cleandoc(ast.get_docstring(node) or "").partition("\n")
+    return Declaration(
+        id=literals["id"],
+        site=literals["site"],
+        equation=equation.strip(),
+        details=details.strip(),
+        parameters=tuple(parameters.values()),
+        needs=tuple(literals["needs"]),
+        cause=literals["cause"],
+        test=literals["test"],
+    )
+
+
+def _ancestry(node: ast.ClassDef, classes: dict[str, ast.ClassDef]) -> list[ast.ClassDef]:
+    """The class and its bases within the folder, bases first, as attributes are inherited."""
+    bases = [classes[base.id] for base in node.bases if isinstance(base, ast.Name) and base.id in classes]
+    return [ancestor for base in bases for ancestor in _ancestry(base, classes)] + [node]
+
+
+def _assignments(node: ast.ClassDef) -> dict[str, ast.expr]:
+    found = {}
+    for statement in node.body:
+        if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name):
+            found[statement.targets[0].id] = statement.value
+        elif isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name) and statement.value:
+            found[statement.target.id] = statement.value
+    return found
+
+
+def _literals(node: ast.ClassDef) -> dict[str, Any]:
+    wanted = {"id", "site", "needs", "cause", "test"}
+    return {name: ast.literal_eval(value) for name, value in _assignments(node).items() if name in wanted}
+
+
+def _parameters(node: ast.ClassDef) -> dict[str, ParameterDeclaration]:
+    found = {}
+    for name, value in _assignments(node).items():
+        if isinstance(value, ast.Call) and isinstance(value.func, ast.Name) and value.func.id == "parameter":
+            unit, typical, meaning = (ast.literal_eval(argument) for argument in value.args)
+            linear = next((ast.literal_eval(k.value) for k in value.keywords if k.arg == "linear"), True)
+            found[name] = ParameterDeclaration(name, unit, float(typical), meaning, linear)
+    return found

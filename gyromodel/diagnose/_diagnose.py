@@ -1,0 +1,203 @@
+"""`diagnose`: what a simulation gets wrong on measured data, why, and what is gained by mending it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gyromodel.campaign import Campaign
+from gyromodel.diagnose._average import average
+from gyromodel.diagnose._bank import Bank, build_bank
+from gyromodel.diagnose._calibrate import null_scores
+from gyromodel.diagnose._gain import ladder_error, nested_gain, no_gain
+from gyromodel.diagnose._result import Candidate, Diagnosis, Gain, Round
+from gyromodel.diagnose._scan import Scanner
+from gyromodel.diagnose._search import Found, Progress, Ranking, Selection, is_driver, search
+from gyromodel.diagnose._variance import growing_noise, tails, with_variance
+from gyromodel.diagnose._verdict import driver_shape, judge, minimum_detectable, testable
+from gyromodel.estimate import Estimate, fit_record
+from gyromodel.model import GyroModel, record_span
+from gyromodel.noise import NoiseGrid, noise_grid
+from gyromodel.signals import Record, read_signals
+from gyromodel.units import convertible, factor
+
+# ln of the evidence ratio that no noise in or near the family reaches once in a hundred campaigns.
+SAFE_THRESHOLD = 5.0
+
+
+class _Session:
+    """One record with its search laid out: what the main pass and every fold do alike."""
+
+    def __init__(self, record: Record, bank: Bank, grid: NoiseGrid, threshold: float) -> None:
+        self.record, self.bank, self.grid, self.threshold = record, bank, grid, threshold
+        self.scanner = Scanner(record, bank, grid)
+        self._ladder: dict[int, tuple[float, float]] = {}
+
+    def ladder(self, estimate: Estimate) -> tuple[float, float]:
+        """Held-out rms and log score of an estimate's structure, computed once."""
+        if id(estimate) not in self._ladder:
+            self._ladder[id(estimate)] = ladder_error(estimate.record, estimate)
+        return self._ladder[id(estimate)]
+
+    def run(self, baseline: Estimate, progress: Progress = None) -> Selection:
+        """The rounds; after the first, a step must also lower the error on blocks left out."""
+
+        def accept(before: Estimate, after: Estimate) -> bool:
+            return before is baseline or self.ladder(after)[1] > self.ladder(before)[1]
+
+        return search(self.record, self.scanner, baseline, self.threshold, accept=accept, progress=progress)
+
+
+def diagnose(
+    campaigns: Campaign | Sequence[Campaign],
+    model: GyroModel,
+    *,
+    calibrate: int = 0,
+    seed: int = 0,
+    progress: Progress = None,
+) -> Diagnosis:
+    """Find what a model lacks on one unit's campaigns.
+
+    Args:
+        campaigns: measured data of one unit; long ones are averaged first, and the findings say so.
+        model: what the simulation contains.
+        calibrate: draws of simulated data with nothing hidden that set the threshold; 0 takes the safe threshold.
+        seed: of those draws.
+        progress: called with a line and the fraction done.
+
+    Raises:
+        CampaignError, ModelError, EstimateError: the data or the model cannot answer; the message says why.
+    """
+    say = progress or (lambda line, done: None)
+    campaigns = [campaigns] if isinstance(campaigns, Campaign) else list(campaigns)
+    findings = []
+    shortened = [average(c) for c in campaigns]
+    if any(m > 1 for _, m in shortened):
+        most = max(m for _, m in shortened)
+        findings.append(f"Means of {most} consecutive samples were searched: lines above their sample rate and quantisation are averaged away.")
+    record = read_signals([c for c, _ in shortened])
+    say("fitting the simulation", 0.02)
+    baseline = fit_record(record, model)
+    say("laying out the search", 0.06)
+    bank = build_bank(record)
+    grid = _grid(record, baseline)
+    session = _Session(record, bank, grid, SAFE_THRESHOLD)
+    nulls = np.zeros(0)
+    if calibrate:
+        nulls = null_scores(session.scanner, baseline, calibrate, seed, say)
+        session.threshold = float(np.quantile(nulls, 0.99))
+    selection = session.run(baseline, say)
+    grows = growing_noise(record, selection.estimate)
+    if grows is not None:
+        findings.append(f"The noise level follows {grows[0]}; samples are weighted accordingly.")
+        record = with_variance(record, grows[1])
+        baseline = fit_record(record, model)
+        session = _Session(record, bank, grid, session.threshold)
+        selection = session.run(baseline, say)
+    heavy = tails(selection.estimate)
+    findings += [heavy] if heavy else []
+    say("judging", 0.65)
+    judgement = judge(record, session.scanner, baseline, selection, len(bank.names()), nulls)
+    unit = _rate_unit(campaigns[0])
+    scale = factor("rad/s", unit)
+    extended = fit_record(selection.estimate.record, _free_noise(selection.estimate), intervals=True)
+    gain = _gain(session, baseline, selection, unit, scale, say)
+    driver = driver_shape(session.scanner, selection, judgement.driver, unit) if judgement.driver else None
+    say("done", 1.0)
+    whole = shortened[0][0] if len(shortened) == 1 else _together([c for c, _ in shortened])
+    before, after = (np.asarray(e.model.predict(record.signals))[: record.rows] for e in (baseline, extended))
+    output = np.where(record.present, np.asarray(record.signals["output"])[: record.rows], np.nan)
+    return Diagnosis(
+        verdict=judgement.verdict,
+        causes=judgement.causes,
+        driver=driver,
+        gain=gain,
+        next_test=judgement.next_test,
+        minimum_detectable=minimum_detectable(session.scanner, selection.last, session.threshold, unit),
+        not_testable=bank.not_testable | testable(session.scanner, selection.last),
+        noise=extended.noise_table(),
+        rounds=_rounds(session, selection, scale),
+        credible_set=judgement.credible_set,
+        unexplained=judgement.unexplained,
+        findings=(*findings, *judgement.findings),
+        threshold=session.threshold,
+        threshold_kind="calibrated" if calibrate else "safe",
+        searched=bank.names(),
+        campaign=whole,
+        predicted_before=before,
+        predicted_after=after,
+        residual_before=(output - before) / float(baseline.model.gain()) * scale,
+        residual_after=(output - after) / float(extended.model.gain()) * scale,
+        rate_unit=unit,
+        baseline=baseline,
+        extended=extended,
+    )
+
+
+def _free_noise(estimate: Estimate) -> GyroModel:
+    model = estimate.model
+    return model if estimate.noise_given else GyroModel(model.effects, {}, model.fixed, model.gyro)
+
+
+def _grid(record: Record, baseline: Estimate) -> NoiseGrid:
+    """Noise cells to sum over: all of the family, or the one the model states."""
+    span = record_span(record)
+    if baseline.noise_given:
+        ratios = type(baseline.ratios)(*(np.atleast_1d(r) for r in baseline.ratios))
+        return NoiseGrid(ratios, np.zeros(1), record.interval, max(span, 2 * record.interval))
+    return noise_grid(int(record.present.sum()), record.interval, span)
+
+
+def _rate_unit(campaign: Campaign) -> str:
+    """The unit errors are reported in: the output's if it is a rate, else the rate column's, else deg/s."""
+    for name in ("output", "rate"):
+        if name in campaign.units and convertible(campaign.units[name], "rad/s"):
+            return campaign.units[name]
+    return "deg/s"
+
+
+def _gain(session: _Session, baseline: Estimate, selection: Selection, unit: str, scale: float, say) -> Gain:
+    if not any(f.effect is not None for f in selection.found):
+        return no_gain(session.record, baseline, unit, scale)
+
+    def select(record: Record, base: Estimate) -> Estimate:
+        fold = _Session(record, session.bank, session.grid, session.threshold)
+        return fold.run(base).estimate
+
+    return nested_gain(
+        session.record, baseline, select, unit, scale, lambda k, n: say(f"held-out block {k} of {n}", 0.7 + 0.28 * k / n)
+    )
+
+
+def _rounds(session: _Session, selection: Selection, scale: float) -> tuple[Round, ...]:
+    steps: list[tuple[Found | None, Ranking, Estimate]] = [
+        (f, f.ranking, e) for f, e in zip(selection.found, selection.estimates[1:], strict=False)
+    ]
+    rounds = []
+    before = session.ladder(selection.estimates[0])
+    rounds.append(Round(None, 0.0, _ranking(selection.found[0].ranking if selection.found else selection.last), before[0] * scale, before[1]))
+    for step, ranking, estimate in steps:
+        assert step is not None
+        rms, score = session.ladder(estimate)
+        rounds.append(Round(step.name, ranking.statistic[step.name], _ranking(ranking), rms * scale, score))
+    return tuple(rounds)
+
+
+def _ranking(ranking: Ranking) -> tuple[Candidate, ...]:
+    order = sorted(ranking.statistic, key=lambda k: -ranking.statistic[k])[:12]
+    return tuple(Candidate(str(k), ranking.statistic[k], ranking.posterior[k], "driver" if is_driver(k) else "effect") for k in order)
+
+
+def _together(campaigns: list[Campaign]) -> Campaign:
+    first = campaigns[0]
+    names = [n for n in first.columns if n != "time"]
+    columns = {"time": [], **{n: [] for n in names}}
+    start = 0.0
+    for campaign in campaigns:
+        time = campaign.in_unit("time", first.units["time"])
+        columns["time"].append(time - time[0] + start)
+        start = columns["time"][-1][-1] + np.median(np.diff(time))
+        for name in names:
+            columns[name].append(campaign.in_unit(name, first.units[name]))
+    return Campaign({n: np.concatenate(v) for n, v in columns.items()}, first.units, first.metadata, first.name)

@@ -1,0 +1,39 @@
+"""Evidence ratios of added columns, and what they sum to over shapes, sizes and noise.
+
+Prior on the added coefficients: N(0, t²σ²(AᵀA)⁻¹), σ profiled out, averaged over t² (so that small and large effects are
+ranked alike) and over the candidate's shapes (which is the price of the search).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+SIZES = np.array([1e1, 1e2, 1e3, 1e4])
+
+
+def log_evidence_ratio(t: np.ndarray, rss: np.ndarray | float, nu: int, q: np.ndarray | int) -> np.ndarray:
+    """ln B of adding q columns that explain `t` of the residual sum `rss` with ν degrees of freedom."""
+    part = np.clip(t / rss, 0.0, 1.0)
+    half = 0.5 * np.asarray(q, float)
+    total = np.full(np.shape(part), -np.inf)
+    for size in SIZES:
+        total = np.logaddexp(total, -0.5 * nu * np.log1p(-size / (1.0 + size) * part) - half * np.log1p(size))
+    return total - np.log(len(SIZES))
+
+
+def explained_for(log_ratio: float, nu: int, q: int) -> float:
+    """The χ²-like statistic ν·t/rss at which ln B reaches a value."""
+    low, high = 0.0, float(nu)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        if log_evidence_ratio(np.array(middle), float(nu), nu, q) < log_ratio:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+def log_mean(values: np.ndarray, axis: int = -1) -> np.ndarray:
+    """ln of the mean of exponentials."""
+    top = values.max(axis=axis, keepdims=True)
+    return np.squeeze(top, axis) + np.log(np.mean(np.exp(values - top), axis=axis))

@@ -1,0 +1,123 @@
+"""Held-out error: blocks left out, predicted by a model fitted without them, selection repeated without each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+from gyromodel.diagnose._result import Gain
+from gyromodel.estimate import Estimate, EstimateError, filter_of, fit_record, whiten_columns
+from gyromodel.model import GyroModel
+from gyromodel.noise import NoiseRatios
+from gyromodel.signals import Record
+
+
+def blocks_of(record: Record) -> list[np.ndarray]:
+    """Rows of each block that has outputs."""
+    present = record.present
+    found = [np.flatnonzero((record.blocks == b) & present) for b in np.unique(record.blocks)]
+    return [rows for rows in found if len(rows)]
+
+
+def held_out(record: Record, train: Estimate, rows: np.ndarray) -> tuple[np.ndarray, float]:
+    """Errors of a block (as a rate) by a model fitted without it, and its log score conditional on the other blocks' noise."""
+    predicted = np.asarray(train.model.predict(record.signals))
+    gain = float(train.model.gain())
+    residual = np.asarray(record.signals["output"]) - predicted
+    with_block = _log_density(record, residual, train)
+    without = _log_density(record.without(rows), residual, train)
+    return residual[rows] / gain, with_block - without
+
+
+def _log_density(record: Record, residual: np.ndarray, estimate: Estimate) -> float:
+    filter = filter_of(record, estimate.ratios)
+    present = np.asarray(record.sampling.present)
+    w = np.asarray(whiten_columns(filter, jnp.asarray(np.where(present, residual, 0.0))[:, None]))[:, 0]
+    variance = estimate.white_variance
+    return float(-0.5 * np.sum(w**2) / variance - 0.5 * filter.log_determinant - 0.5 * present.sum() * np.log(2 * np.pi * variance))
+
+
+def fit_without(record: Record, rows: np.ndarray, model: GyroModel, ratios: NoiseRatios) -> Estimate | None:
+    """The model fitted without a block at known noise ratios; None where the rest does not determine it."""
+    try:
+        return fit_record(record.without(rows), model, ratios=ratios)
+    except EstimateError:
+        return None
+
+
+def ladder_error(record: Record, estimate: Estimate) -> tuple[float, float]:
+    """Held-out rms (rad/s) and log score of one model structure, refitted without each block."""
+    errors, score = [], 0.0
+    for rows in blocks_of(record):
+        train = fit_without(record, rows, estimate.model, estimate.ratios)
+        if train is None:
+            continue
+        error, log_score = held_out(record, train, rows)
+        errors.append(error)
+        score += log_score
+    return (float(np.sqrt(np.mean(np.concatenate(errors) ** 2))), score) if errors else (np.nan, -np.inf)
+
+
+def nested_gain(
+    record: Record,
+    baseline: Estimate,
+    select: Callable[[Record, Estimate], Estimate],
+    unit: str,
+    scale: float,
+    progress: Callable[[int, int], None] | None = None,
+) -> Gain:
+    """Gain on blocks that neither fit nor selection saw.
+
+    Args:
+        record: the data.
+        baseline: the fitted simulation.
+        select: repeats the whole selection on a record without a block.
+        unit: reporting unit of the errors.
+        scale: reporting units per rad/s.
+        progress: called with folds done and in all.
+    """
+    before, after, scores = [], [], []
+    blocks = blocks_of(record)
+    for k, rows in enumerate(blocks):
+        try:
+            base = fit_record(record.without(rows), baseline.model if baseline.noise_given else _free(baseline.model))
+            extended = select(record.without(rows), base)
+        except EstimateError:
+            continue
+        e0, s0 = held_out(record, base, rows)
+        e1, s1 = held_out(record, extended, rows)
+        before.append(np.mean(e0**2))
+        after.append(np.mean(e1**2))
+        scores.append(s1 - s0)
+        if progress:
+            progress(k + 1, len(blocks))
+    return _summary(np.array(before), np.array(after), np.array(scores), record.block_scheme, unit, scale)
+
+
+def _free(model: GyroModel) -> GyroModel:
+    return GyroModel(model.effects, {}, model.fixed, model.gyro)
+
+
+def _summary(before, after, scores, scheme: str, unit: str, scale: float) -> Gain:
+    folds = len(scores)
+    if folds < 2:
+        return Gain(np.nan, np.nan, unit, 1.0, (0.0, np.inf), f"{scheme}: too few to hold one out", folds, 0.0, (-np.inf, np.inf))
+    rms = float(np.sqrt(before.mean()) * scale), float(np.sqrt(after.mean()) * scale)
+    ratio = rms[0] / rms[1] if rms[1] > 0 else 1.0
+    # Jackknife over blocks for the ratio, Student's t over blocks for the log score.
+    logs = np.array([0.5 * np.log(np.delete(before, k).mean() / np.delete(after, k).mean()) for k in range(folds)])
+    spread = np.sqrt((folds - 1) / folds * np.sum((logs - logs.mean()) ** 2))
+    t = stats.t.ppf(0.975, folds - 1)
+    total, error = float(scores.sum()), float(np.sqrt(folds) * scores.std(ddof=1))
+    interval = (float(ratio * np.exp(-t * spread)), float(ratio * np.exp(t * spread)))
+    return Gain(rms[0], rms[1], unit, ratio, interval, f"nested, one of {folds} {scheme} left out", folds, total, (total - t * error, total + t * error))
+
+
+def no_gain(record: Record, baseline: Estimate, unit: str, scale: float) -> Gain:
+    """The gain of an unchanged model: its held-out error, twice."""
+    rms, _ = ladder_error(record, baseline)
+    folds = len(blocks_of(record))
+    return Gain(rms * scale, rms * scale, unit, 1.0, (1.0, 1.0), f"one of {folds} {record.block_scheme} left out", folds, 0.0, (0.0, 0.0))

@@ -1,0 +1,148 @@
+"""What a diagnosis found, in reporting units; `Diagnosis.to_dict` is the public `diagnosis.json`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from gyromodel.campaign import Campaign
+from gyromodel.estimate import Estimate
+
+Verdict = Literal["adequate", "named", "ambiguous", "unknown"]
+
+
+@dataclass(frozen=True)
+class ParameterValue:
+    """A fitted parameter in its declared unit."""
+
+    name: str
+    value: float
+    std: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Confuser:
+    """Another effect that looks alike on this campaign; separation 0 is indistinguishable, 1 is orthogonal."""
+
+    effect: str
+    separation: float
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A discrepancy's cause: its evidence (ln of the evidence ratio), its parameters and what it could be mistaken for."""
+
+    effect: str
+    parameters: tuple[ParameterValue, ...]
+    statistic: float
+    p_value: float
+    p_adjusted: float
+    posterior: float
+    confusers: tuple[Confuser, ...] = ()
+    points: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One entry of a round's ranking."""
+
+    effect: str
+    statistic: float
+    posterior: float
+    kind: Literal["effect", "driver", "noise", "none"]
+
+
+@dataclass(frozen=True)
+class Round:
+    """One step of the ladder: what was added, on what evidence, and the error on data it had not seen."""
+
+    added: str | None
+    statistic: float
+    ranking: tuple[Candidate, ...]
+    held_out: float
+    log_score: float
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Held-out error before and after the extension, selection repeated without each fold (`ratio` above 1 is better)."""
+
+    before: float
+    after: float
+    unit: str
+    ratio: float
+    ci95: tuple[float, float]
+    scheme: str
+    folds: int
+    log_score: float
+    log_score_ci95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Driver:
+    """The smooth function of one column (or of time) that an unknown discrepancy follows, with its standard error."""
+
+    column: str
+    unit: str
+    x: np.ndarray
+    y: np.ndarray
+    std: np.ndarray
+    y_unit: str
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The whole answer; arrays have one entry per campaign row, residuals are measured minus model as a rate."""
+
+    verdict: Verdict
+    causes: tuple[Cause, ...]
+    driver: Driver | None
+    gain: Gain
+    next_test: str | None
+    minimum_detectable: Mapping[str, tuple[float, str]]
+    not_testable: Mapping[str, str]
+    noise: Mapping[str, Mapping[str, float | str]]
+    rounds: tuple[Round, ...]
+    credible_set: Mapping[str, float]
+    unexplained: Mapping[str, float]
+    findings: tuple[str, ...]
+    threshold: float
+    threshold_kind: Literal["safe", "calibrated"]
+    searched: tuple[str, ...]
+    campaign: Campaign = field(repr=False)
+    predicted_before: np.ndarray = field(repr=False)
+    predicted_after: np.ndarray = field(repr=False)
+    residual_before: np.ndarray = field(repr=False)
+    residual_after: np.ndarray = field(repr=False)
+    rate_unit: str = "deg/s"
+    baseline: Estimate = field(repr=False, default=None)  # type: ignore[assignment]
+    extended: Estimate = field(repr=False, default=None)  # type: ignore[assignment]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The public, JSON-ready form."""
+        driver = None
+        if self.driver is not None:
+            d = self.driver
+            shape = {"x": d.x.tolist(), "y": d.y.tolist(), "std": d.std.tolist(), "x_unit": d.unit, "y_unit": d.y_unit}
+            driver = {"column": d.column, "shape": shape}
+        return {
+            "verdict": self.verdict,
+            "causes": [asdict(c) for c in self.causes],
+            "driver": driver,
+            "gain": asdict(self.gain),
+            "next_test": self.next_test,
+            "minimum_detectable": {k: {"size": s, "unit": u} for k, (s, u) in self.minimum_detectable.items()},
+            "not_testable": dict(self.not_testable),
+            "noise": {k: dict(v) for k, v in self.noise.items()},
+            "credible_set": dict(self.credible_set),
+            "unexplained": dict(self.unexplained),
+            "findings": list(self.findings),
+            "rounds": [asdict(r) for r in self.rounds],
+            "threshold": self.threshold,
+            "threshold_kind": self.threshold_kind,
+            "searched": list(self.searched),
+        }

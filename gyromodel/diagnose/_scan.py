@@ -1,0 +1,339 @@
+"""One pass of the search: the evidence of every candidate in every noise cell, given the baseline's Jacobian and residual.
+
+Per cell, the candidates' own energies CᵀV⁻¹C are computed once; each round then needs only V⁻¹ applied to the baseline's
+columns and residual, and inner products with raw columns. Steps and pulses at every epoch and lines at every frequency
+use cumulative sums and Fourier transforms of V⁻¹r instead of columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.fft
+from scipy.special import gammaln, logsumexp
+
+from gyromodel.diagnose._bank import Bank
+from gyromodel.diagnose._evidence import log_evidence_ratio, log_mean
+from gyromodel.estimate import make_filter, whiten_columns
+from gyromodel.model import record_span
+from gyromodel.noise import NoiseGrid, NoiseRatios
+from gyromodel.numerics.state_space import Filter, step_and_pulse_energy, whiten, whiten_transposed
+from gyromodel.signals import Record
+
+# A candidate whose columns keep less than this share of their energy beside the baseline cannot be tested.
+VANISHED = 1e-6
+# A line's energy is computed exactly at all frequencies of a short record; of a long one at the lowest, at log-spaced ones to
+# interpolate between, and at the leading peaks of each pass.
+EXACT_LINES, LOWEST_LINES, SPACED_LINES, PEAKS = 2500, 24, 40, 12
+COLUMN_STEP = 16
+THREADS = 2
+# Records this short are test points, each of which may be anomalous; longer ones are series with single gross errors.
+TEST_POINTS = 40
+
+_energies = jax.jit(step_and_pulse_energy)
+
+
+@jax.jit
+def _precision(filter: Filter, columns):
+    return whiten_transposed(filter, whiten(filter, columns))
+
+
+@dataclass
+class LineGrid:
+    """Frequencies searched for lines (Hz) and the Fourier grid that serves them."""
+
+    frequencies: np.ndarray
+    index: np.ndarray
+    length: int
+    exact: np.ndarray
+    basis: np.ndarray = field(repr=False)
+
+
+def line_grid(record: Record) -> LineGrid:
+    """A quarter of the record's resolution, up to half the sample rate."""
+    time = np.asarray(record.signals["time"])
+    span = record_span(record)
+    grid = record.interval
+    if np.abs(time[: record.rows] / grid - np.round(time[: record.rows] / grid)).max() > 0.1:
+        grid /= 4.0
+    grid = max(grid, span / 2**18)
+    length = scipy.fft.next_fast_len(int(np.ceil(4.0 * (span + grid) / grid)), real=True)
+    frequencies = np.arange(1, length // 2 + 1) / (length * grid)
+    frequencies = frequencies[frequencies < 0.5 / record.interval * (1 - 0.5 / record.rows)]
+    exact = np.arange(len(frequencies))
+    if len(exact) > EXACT_LINES:
+        spaced = np.geomspace(LOWEST_LINES + 1, len(frequencies), SPACED_LINES).round().astype(int) - 1
+        exact = np.unique(np.concatenate([exact[:LOWEST_LINES], np.clip(spaced, 0, len(frequencies) - 1)]))
+    phase = 2.0 * np.pi * time[:, None] * frequencies[exact]
+    index = np.minimum(np.round(time / grid).astype(int), length - 1)
+    return LineGrid(frequencies, index, length, exact, np.concatenate([np.cos(phase), np.sin(phase)], axis=1))
+
+
+@dataclass
+class Cell:
+    """What one noise cell remembers between rounds."""
+
+    filter: Filter
+    log_determinant: float
+    blocks: dict[int, np.ndarray]
+    step: np.ndarray
+    pulse: np.ndarray
+    line: np.ndarray
+
+
+@dataclass
+class CellResult:
+    """One cell's verdict on every candidate, beside its own restricted likelihood."""
+
+    log_likelihood: float
+    rss: float
+    evidence: dict[str, float]
+    best: dict[str, tuple[int | tuple[int, ...], float, float]]
+    energy: dict[str, np.ndarray]
+
+
+class Scanner:
+    """Evidence of a bank's candidates on one record (or the record less some rows), over noise cells."""
+
+    def __init__(self, record: Record, bank: Bank, grid: NoiseGrid, *, outliers: bool = True) -> None:
+        self.record, self.bank, self.grid = record, bank, grid
+        self.present = np.asarray(record.sampling.present)
+        single = int(np.asarray(record.sampling.restart).sum()) == 1
+        self.steps = single and "bias_step" in bank.scans
+        self.lines = line_grid(record) if single and "bias_periodic" in bank.scans and record.rows >= 16 else None
+        self.outliers = outliers
+        self.by_points = int(self.present.sum()) <= TEST_POINTS
+        self.cells: dict[int, Cell] = {}
+        extra = self.lines.basis if self.lines else np.zeros((len(self.present), 0))
+        raw = np.concatenate([bank.columns, extra], axis=1)
+        self._raw = jnp.asarray(np.pad(raw, ((0, 0), (0, -raw.shape[1] % COLUMN_STEP))))
+        widths = [b.width for b in bank.blocks]
+        self._layout = {q: (widths.index(q), widths.count(q), bank.blocks[widths.index(q)].start) for q in sorted(set(widths))}
+        names = [b.name for b in bank.blocks]
+        self._members = {name: np.flatnonzero(np.array(names) == name) for name in dict.fromkeys(names)}
+        self._positive = np.array([b.effect is not None and b.effect.positive for b in bank.blocks])
+        self.epochs = np.flatnonzero(self.present[: record.rows])[1:-1]
+
+    def all_cells(self) -> list[int]:
+        """Every noise cell."""
+        return list(range(len(self.grid.log_prior)))
+
+    def _levels(self) -> tuple[np.ndarray, np.ndarray]:
+        flicker, walk = (np.unique(np.asarray(r), return_inverse=True)[1] for r in self.grid.ratios)
+        return flicker, walk
+
+    def coarse_cells(self) -> list[int]:
+        """Every other level of flicker and of walk."""
+        flicker, walk = self._levels()
+        return [g for g in self.all_cells() if flicker[g] % 2 == 0 and walk[g] % 2 == 0]
+
+    def neighbours(self, cells: set[int]) -> list[int]:
+        """These cells and those one level away."""
+        flicker, walk = self._levels()
+        return [g for g in self.all_cells() if any(abs(flicker[g] - flicker[c]) <= 1 and abs(walk[g] - walk[c]) <= 1 for c in cells)]
+
+    def _prepare(self, g: int) -> Cell:
+        ratios = NoiseRatios(self.grid.ratios.flicker[g], self.grid.ratios.walk[g])
+        filter = make_filter(ratios, self.grid.interval, self.grid.span, self.record.sampling)
+        w = np.asarray(whiten_columns(filter, self._raw))
+        blocks = {}
+        for q, (_, count, start) in self._layout.items():
+            part = w[:, start : start + q * count].T.reshape(count, q, -1)
+            blocks[q] = part @ part.transpose(0, 2, 1)
+        line = np.zeros((0, 2, 2))
+        if self.lines:
+            lw = w[:, self.bank.columns.shape[1] :][:, : self.lines.basis.shape[1]]
+            line = _line_energy(lw, self.lines)
+        step, pulse = (np.asarray(e) for e in _energies(filter))
+        return Cell(filter, float(filter.log_determinant), blocks, step, pulse, line)
+
+    def cell(self, g: int) -> Cell:
+        """The cell's memory, made at first use."""
+        if g not in self.cells:
+            self.cells[g] = self._prepare(g)
+        return self.cells[g]
+
+    def whiten(self, g: int, columns: jax.Array) -> np.ndarray:
+        """Columns whitened in one noise cell."""
+        padded = jnp.pad(columns, ((0, 0), (0, -columns.shape[1] % COLUMN_STEP)))
+        return np.asarray(whiten_columns(self.cell(g).filter, padded))[:, : columns.shape[1]]
+
+    def run(self, cells: Sequence[int], jacobian: np.ndarray, residual: np.ndarray) -> dict[int, CellResult]:
+        """Evaluate every candidate against a baseline in the given noise cells."""
+        stacked = np.column_stack([jacobian, residual])
+        pad = -stacked.shape[1] % COLUMN_STEP
+        data = jnp.asarray(np.pad(np.where(self.present[:, None], stacked, 0.0), ((0, 0), (0, pad))))
+        with ThreadPoolExecutor(THREADS) as pool:
+            results = list(pool.map(lambda g: self._run_cell(g, data, jacobian.shape[1]), cells))
+        return dict(zip(cells, results, strict=True))
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Samples present."""
+        return int(self.present.sum())
+
+    def _run_cell(self, g: int, data: jax.Array, p: int) -> CellResult:
+        cell = self.cell(g)
+        z = np.asarray(_precision(cell.filter, data))[:, : p + 1]
+        x = np.asarray(data)[:, : p + 1]
+        gram = x.T @ z
+        norm = np.sqrt(np.maximum(np.diag(gram)[:p], 1e-300))
+        scaled = gram[:p, :p] / np.outer(norm, norm) + 1e-13 * np.eye(p)
+        root = np.linalg.inv(np.linalg.cholesky(scaled)) / norm
+        jy = root @ gram[:p, p]
+        rss = max(float(gram[p, p] - jy @ jy), 1e-300)
+        nu = int(self.present.sum()) - p
+        log_j = 2.0 * np.log(norm).sum() + np.linalg.slogdet(scaled)[1]
+        likelihood = -0.5 * cell.log_determinant - 0.5 * log_j - 0.5 * nu * np.log(rss)
+        result = CellResult(likelihood, rss, {}, {}, {})
+        zj = z[:, :p] @ root.T
+        zy = z[:, p] - zj @ jy
+        self._blocks(result, cell, zj, zy, nu)
+        rows = self.epochs
+        if self.steps:
+            sj, sy = (np.cumsum(v[::-1], axis=0)[::-1][rows] for v in (zj, zy))
+            self._single(result, "bias_step", rows, sy, cell.step[rows], sj, nu)
+        if self.outliers:
+            rows = np.flatnonzero(self.present[: self.record.rows])
+            if self.by_points:
+                self._test_points(result, cell, zj[rows], zy[rows], rows, nu)
+            else:
+                self._single(result, "outliers", rows, zy[rows], cell.pulse[rows], zj[rows], nu)
+        if self.lines:
+            self._lines(result, cell, zj, zy, nu)
+        return result
+
+    def _blocks(self, result: CellResult, cell: Cell, zj: np.ndarray, zy: np.ndarray, nu: int) -> None:
+        cross = self.bank.columns.T @ zj
+        against = self.bank.columns.T @ zy
+        count_all = len(self.bank.blocks)
+        t_of, q_of, energy = np.zeros(count_all), np.zeros(count_all), np.zeros(count_all)
+        for q, (first, count, start) in self._layout.items():
+            own = cell.blocks[q]
+            c = cross[start : start + q * count].reshape(count, q, -1)
+            b = against[start : start + q * count].reshape(count, q)
+            norm = np.sqrt(np.maximum(np.einsum("bii->bi", own), 1e-300))
+            a = (own - c @ c.transpose(0, 2, 1)) / (norm[:, :, None] * norm[:, None, :])
+            values, vectors = np.linalg.eigh(a)
+            keep = values > VANISHED
+            along = np.einsum("bij,bi->bj", vectors, b / norm)
+            t = np.sum(np.where(keep, along**2 / np.where(keep, values, 1.0), 0.0), axis=1)
+            here = slice(first, first + count)
+            t_of[here] = np.where(self._positive[here] & (b[:, 0] < 0), 0.0, t)
+            q_of[here] = keep.sum(1)
+            energy[here] = np.sum(values * keep, axis=1) / np.maximum(q_of[here], 1) * np.mean(norm**2, axis=1)
+        ratio = np.where(q_of > 0, log_evidence_ratio(t_of, result.rss, nu, q_of), -np.inf)
+        for name, mine in self._members.items():
+            result.energy[name] = energy[mine]
+            top = int(mine[np.argmax(ratio[mine])])
+            if np.isfinite(ratio[top]):
+                result.evidence[name] = float(log_mean(ratio[mine][np.isfinite(ratio[mine])]))
+                result.best[name] = (top, float(t_of[top]), float(q_of[top]))
+
+    def _single(self, result, name: str, where: np.ndarray, b: np.ndarray, own: np.ndarray, cross: np.ndarray, nu: int) -> None:
+        left = own - np.sum(cross**2, axis=1)
+        keep = left > VANISHED * own
+        t = np.where(keep, b**2 / np.where(keep, left, 1.0), 0.0)
+        self._record(result, name, where, t, np.where(keep, left, 0.0), 1, nu)
+
+    def _test_points(self, result, cell: Cell, zj: np.ndarray, zy: np.ndarray, rows: np.ndarray, nu: int) -> None:
+        """Sets of anomalous points, of any size up to a third: ordered by a robust fit, priced by how many sets there are."""
+        identity = jnp.zeros((len(self.present), len(rows))).at[rows, np.arange(len(rows))].set(1.0)
+        precision = np.asarray(_precision(cell.filter, identity))[rows]
+        left = precision - zj @ zj.T
+        most = max(1, min(len(rows) // 3, nu - 1))
+        ratios, sets = [], []
+        chosen: list[int] = []
+        order = _robust_order(left, zy)
+        for m in range(1, most + 1):
+            chosen = list(order[:m])
+            block = left[np.ix_(chosen, chosen)]
+            t = float(zy[chosen] @ np.linalg.lstsq(block, zy[chosen], rcond=1e-10)[0])
+            price = gammaln(len(rows) + 1) - gammaln(m + 1) - gammaln(len(rows) - m + 1) + np.log(most)
+            ratios.append(float(log_evidence_ratio(np.array(min(t, result.rss)), result.rss, nu, m)) - price)
+            sets.append((rows[chosen], t))
+        top = int(np.argmax(ratios))
+        result.evidence["outliers"] = float(logsumexp(ratios))
+        result.best["outliers"] = (tuple(int(r) for r in sets[top][0]), sets[top][1], float(top + 1))
+        result.energy["outliers"] = np.diag(left)
+
+    def _lines(self, result: CellResult, cell: Cell, zj: np.ndarray, zy: np.ndarray, nu: int) -> None:
+        assert self.lines is not None
+        grid = self.lines
+        count = len(grid.frequencies)
+        spread = np.zeros((grid.length, zj.shape[1] + 1))
+        np.add.at(spread, grid.index, np.column_stack([zj, zy]))
+        spectrum = scipy.fft.rfft(spread, axis=0)[1 : count + 1]
+        c, s = spectrum.real, -spectrum.imag
+        a11 = cell.line[:, 0, 0] - np.sum(c[:, :-1] ** 2, axis=1)
+        a22 = cell.line[:, 1, 1] - np.sum(s[:, :-1] ** 2, axis=1)
+        a12 = cell.line[:, 0, 1] - np.sum(c[:, :-1] * s[:, :-1], axis=1)
+        determinant = a11 * a22 - a12**2
+        own = cell.line[:, 0, 0] * cell.line[:, 1, 1]
+        keep = (determinant > 1e-3 * own) & (a11 > 0)
+        bc, bs = c[:, -1], s[:, -1]
+        t = np.where(keep, (a22 * bc**2 - 2 * a12 * bc * bs + a11 * bs**2) / np.where(keep, determinant, 1.0), 0.0)
+        if len(grid.exact) < count:
+            self._exact_peaks(cell, t, c, s)
+        self._record(result, "bias_periodic", np.arange(count), t, np.where(keep, a11, 0.0), 2, nu)
+
+    def _exact_peaks(self, cell: Cell, t: np.ndarray, c: np.ndarray, s: np.ndarray) -> None:
+        """Replace the leading peaks' statistic, in place, by the one with their exact energy."""
+        assert self.lines is not None
+        local = np.flatnonzero((t[1:-1] >= t[:-2]) & (t[1:-1] >= t[2:])) + 1
+        peaks = local[np.argsort(-t[local])][:PEAKS]
+        phase = 2.0 * np.pi * np.asarray(self.record.signals["time"])[:, None] * self.lines.frequencies[peaks]
+        basis = np.pad(np.concatenate([np.cos(phase), np.sin(phase)], axis=1), ((0, 0), (0, 2 * (PEAKS - len(peaks)))))
+        w = np.asarray(whiten_columns(cell.filter, jnp.asarray(basis)))
+        for i, k in enumerate(peaks):
+            pair = w[:, [i, len(peaks) + i]]
+            cross = np.stack([c[k], s[k]])
+            a = pair.T @ pair - cross[:, :-1] @ cross[:, :-1].T
+            sound = np.linalg.det(a) > 1e-3 * np.prod(np.sum(pair**2, axis=0))
+            t[k] = cross[:, -1] @ np.linalg.solve(a, cross[:, -1]) if sound else 0.0
+
+    def _record(self, result, name: str, where: np.ndarray, t: np.ndarray, energy: np.ndarray, q: int, nu: int) -> None:
+        if not len(where):
+            return
+        t = np.minimum(t, result.rss)
+        ratio = log_evidence_ratio(t, result.rss, nu, q)
+        top = int(np.argmax(ratio))
+        result.evidence[name] = float(log_mean(ratio))
+        result.best[name] = (int(where[top]), float(t[top]), float(q))
+        result.energy[name] = energy
+
+
+def _robust_order(left: np.ndarray, zy: np.ndarray) -> np.ndarray:
+    """Rows by how anomalous they are, from a backward search: drop the worst, refit, repeat."""
+    rows, dropped = list(range(len(zy))), []
+    best: tuple[float, list[int]] = (np.inf, [])
+    # Start from every pair of points held good, keep the start whose median misfit is least: masking cannot hide there.
+    covariance, y = left, zy
+    for i in range(len(rows)):
+        for j in range(i):
+            out = [k for k in rows if k not in (i, j)]
+            shift = np.linalg.lstsq(covariance[np.ix_(out, out)], y[out], rcond=1e-10)[0]
+            misfit = np.sort(np.abs(shift))[len(out) // 2]
+            if misfit < best[0]:
+                best = (float(misfit), [out[k] for k in np.argsort(-np.abs(shift))])
+    return np.array(best[1] + dropped)
+
+
+def _line_energy(whitened: np.ndarray, grid: LineGrid) -> np.ndarray:
+    """2×2 energies of cosine and sine at every frequency: exact at some, the mean power interpolated between."""
+    count = len(grid.exact)
+    c, s = whitened[:, :count], whitened[:, count:]
+    cc, ss, cs = (c**2).sum(0), (s**2).sum(0), (c * s).sum(0)
+    mean = np.interp(np.log(grid.frequencies), np.log(grid.frequencies[grid.exact]), 0.5 * (cc + ss))
+    out = np.zeros((len(grid.frequencies), 2, 2))
+    out[:, 0, 0] = out[:, 1, 1] = mean
+    low = (grid.exact < LOWEST_LINES) | (len(grid.exact) == len(grid.frequencies))
+    i = grid.exact[low]
+    out[i, 0, 0], out[i, 1, 1] = cc[low], ss[low]
+    out[i, 0, 1] = out[i, 1, 0] = cs[low]
+    return out

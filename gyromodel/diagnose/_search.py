@@ -1,0 +1,304 @@
+"""Rounds of the search: rank all candidates, add the best, refit, re-choose the earlier ones, stop when nothing is left."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.special import logsumexp
+
+from gyromodel.diagnose._scan import CellResult, Scanner
+from gyromodel.effects import Effect
+from gyromodel.effects.drivers import BiasPeriodic, BiasStep
+from gyromodel.estimate import Estimate, EstimateError, fit_record
+from gyromodel.model import GyroModel
+from gyromodel.signals import Record
+
+Progress = Callable[[str, float], None] | None
+
+MAXIMUM_ROUNDS = 12
+# Cells within this many nats of the best, for any candidate, get their neighbours searched too.
+NEARBY = 10.0
+# An earlier choice is exchanged when another candidate beats it by this many nats given all the others.
+EXCHANGE = 2.0
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """Evidence of every candidate summed over noise cells, against nothing added."""
+
+    statistic: dict[str, float]
+    posterior: dict[str, float]
+    results: dict[int, CellResult] = field(repr=False)
+    log_prior: np.ndarray = field(repr=False)
+    slow: dict[int, bool] = field(repr=False)
+    baseline_columns: np.ndarray = field(repr=False)
+
+    def best(self, *, drivers: bool) -> tuple[str | None, float]:
+        """The best unknown driver, or the best named candidate, and its evidence ratio (ln)."""
+        mine = {k: v for k, v in self.statistic.items() if is_driver(k) == drivers}
+        top = max(mine, key=lambda k: mine[k]) if mine else None
+        return top, mine[top] if top else -np.inf
+
+    @property
+    def score(self) -> float:
+        """S: the best candidate's evidence ratio (ln)."""
+        return max(self.statistic.values(), default=-np.inf)
+
+    def best_cell(self, name: str | None = None) -> int:
+        """The noise cell of most weight, with a candidate added or with none."""
+
+        def weight(g: int) -> float:
+            r = self.results[g]
+            return r.log_likelihood + self.log_prior[g] + (r.evidence.get(name, -np.inf) if name else 0.0)
+
+        return max(self.results, key=weight)
+
+    def best_form(self, name: str) -> tuple[int | tuple[int, ...], float, float]:
+        """Form, explained sum and dimension of a candidate where it is best."""
+        return self.results[self.best_cell(name)].best[name]
+
+
+def is_driver(name: str) -> bool:
+    """Whether a candidate is a smooth function of measured columns, not a catalogue effect."""
+    return name.startswith("smooth(")
+
+
+@dataclass(frozen=True)
+class Found:
+    """One accepted addition and the ranking that spoke for it."""
+
+    name: str
+    effect: Effect | None
+    rows: tuple[int, ...]
+    ranking: Ranking
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Where the rounds ended: the extended fit, what was added, and the ranking in which nothing more was significant."""
+
+    estimate: Estimate
+    found: tuple[Found, ...]
+    last: Ranking
+    estimates: tuple[Estimate, ...]
+    driver: str | None
+
+
+def rank(scanner: Scanner, cells: list[int], estimate: Estimate, pulses: tuple[int, ...], skip: set[str]) -> Ranking:
+    """Rank every candidate against a fitted baseline; `pulses` are rows given up as gross errors."""
+    record = scanner.record
+    predicted, jacobian = estimate.model.linearise(record.signals)
+    gain = float(estimate.model.gain())
+    residual = np.where(scanner.present, np.asarray(record.signals["output"] - predicted), 0.0) / gain
+    columns = np.asarray(jacobian)
+    if pulses:
+        marks = np.zeros((len(columns), len(pulses)))
+        marks[list(pulses), np.arange(len(pulses))] = 1.0
+        columns = np.concatenate([columns, marks], axis=1)
+    results = scanner.run(cells, columns, residual)
+    prior = scanner.grid.log_prior
+    logs = np.array([results[g].log_likelihood + prior[g] for g in cells])
+    null = float(logsumexp(logs))
+    statistic = {}
+    for name in sorted({n for r in results.values() for n in r.evidence} - skip):
+        each = [results[g].evidence.get(name, -np.inf) for g in cells]
+        statistic[name] = float(logsumexp(logs + np.array(each)) - null)
+    total = logsumexp(list(statistic.values())) if statistic else 0.0
+    posterior = {k: float(np.exp(v - total)) for k, v in statistic.items()}
+    walk, flicker = scanner.grid.ratios.walk, scanner.grid.ratios.flicker
+    slow = {g: float(walk[g]) > 0 or float(flicker[g]) > 0 for g in cells}
+    return Ranking(statistic, posterior, results, prior, slow, columns)
+
+
+def rank_where_it_matters(scanner: Scanner, estimate: Estimate, pulses: tuple[int, ...]) -> Ranking:
+    """Rank over the noise cells that matter: every other level, then the neighbours of those with weight for a candidate."""
+    skip = skipped(estimate.model)
+    if estimate.noise_given:
+        return rank(scanner, scanner.all_cells(), estimate, pulses, skip)
+    ranking = rank(scanner, scanner.coarse_cells(), estimate, pulses, skip)
+    weights = {g: r.log_likelihood + scanner.grid.log_prior[g] for g, r in ranking.results.items()}
+    near: set[int] = set()
+    for name in [None, *ranking.statistic]:
+        if name is not None and ranking.statistic[name] < min(ranking.score - NEARBY, 0.0):
+            continue
+        of = {g: w + (ranking.results[g].evidence.get(name, -np.inf) if name else 0.0) for g, w in weights.items()}
+        best = max(of.values())
+        near |= {g for g, v in of.items() if v > best - NEARBY}
+    return rank(scanner, scanner.neighbours(near), estimate, pulses, skip)
+
+
+def search(
+    record: Record,
+    scanner: Scanner,
+    baseline: Estimate,
+    threshold: float,
+    *,
+    accept: Callable[[Estimate, Estimate], bool] | None = None,
+    progress: Progress = None,
+    rounds: int = MAXIMUM_ROUNDS,
+) -> Selection:
+    """Add candidates until nothing more is significant (or `accept` says that a step no longer helps).
+
+    Args:
+        record: the data.
+        scanner: the search laid out on it.
+        baseline: the fitted simulation.
+        threshold: least ln evidence ratio of an addition.
+        accept: called with the estimates before and after a step; False ends the search without the step.
+        progress: called with a line and the fraction done.
+        rounds: at most this many additions.
+    """
+    found: list[Found] = []
+    estimates = [baseline]
+    while True:
+        estimate = estimates[-1]
+        pulses = tuple(r for f in found for r in f.rows)
+        ranking = rank_where_it_matters(scanner, estimate, pulses)
+        name, score = ranking.best(drivers=False)
+        if len(found) >= rounds or name is None or score < threshold:
+            break
+        step = _addition(scanner, estimate, ranking, name, pulses)
+        after = refit(record, baseline, [*found, step])
+        if after is None or (accept is not None and step.effect is not None and not accept(estimate, after)):
+            break
+        if progress:
+            progress(f"found {name}", min(0.25 + 0.06 * len(found), 0.6))
+        found.append(step)
+        estimates.append(after)
+    if sum(f.effect is not None for f in found) > 1:
+        found, estimates[-1] = _exchange(record, scanner, baseline, found, estimates[-1])
+    return _against_drivers(found, ranking, estimates, threshold)
+
+
+def _against_drivers(found: list[Found], last: Ranking, estimates: list[Estimate], threshold: float) -> Selection:
+    """Cut the chain of names where one smooth driver had explained more than all the names from there on together."""
+    for i, step in enumerate(found):
+        driver, score = step.ranking.best(drivers=True)
+        chain = sum(f.ranking.statistic[f.name] for f in found[i:])
+        if i == 0 and driver is not None and score > max(chain + EXCHANGE, threshold):
+            return Selection(estimates[i], tuple(found[:i]), step.ranking, tuple(estimates[: i + 1]), driver)
+    driver, score = last.best(drivers=True)
+    return Selection(estimates[-1], tuple(found), last, tuple(estimates), driver if score >= threshold else None)
+
+
+def skipped(model: GyroModel) -> set[str]:
+    """Candidates that make no sense beside a model: what it has, and what it has in a more general form."""
+    have = set(model.labels) - {"bias_step", "bias_periodic"}
+    return have | {name for e in model.effects for name in e.supersedes}
+
+
+def _addition(scanner: Scanner, estimate: Estimate, ranking: Ranking, name: str, pulses: tuple[int, ...]) -> Found:
+    """A named candidate as an effect at its best form, or as rows given up."""
+    form, _, _ = ranking.best_form(name)
+    if name == "outliers":
+        rows = form if isinstance(form, tuple) else (form,)
+        return Found(name, None, tuple(int(r) for r in rows), ranking)
+    assert isinstance(form, int)
+    effect = form_effect(scanner, name, form)
+    assert effect is not None
+    return Found(name, _solved(scanner, estimate, effect, ranking.best_cell(name), pulses).settled(), (), ranking)
+
+
+def form_effect(scanner: Scanner, name: str, form: int) -> Effect | None:
+    """The effect behind a form number."""
+    if name == "bias_step":
+        time = np.asarray(scanner.record.signals["time"])
+        return BiasStep(epoch=float(time[form] + time[form - 1]) / 2)
+    if name == "bias_periodic":
+        assert scanner.lines is not None
+        return BiasPeriodic(frequency=float(scanner.lines.frequencies[form]))
+    return scanner.bank.blocks[form].effect
+
+
+def _solved(scanner: Scanner, estimate: Estimate, effect: Effect, g: int, pulses: tuple[int, ...]) -> Effect:
+    """The effect at the coefficients that fit best beside the baseline, in one noise cell."""
+    record = scanner.record
+    predicted, jacobian = estimate.model.linearise(record.signals)
+    columns = estimate.model.columns_of(effect, record.signals)
+    residual = jnp.where(record.sampling.present, record.signals["output"] - predicted, 0.0)
+    marks = jnp.zeros((len(residual), len(pulses))).at[jnp.asarray(pulses, int), jnp.arange(len(pulses))].set(1.0)
+    stacked = jnp.column_stack([jacobian, marks, columns, residual])
+    w = np.asarray(scanner.whiten(g, stacked))[:, : stacked.shape[1]]
+    norm = np.linalg.norm(w[:, :-1], axis=0)
+    norm[norm == 0] = 1.0
+    solution = np.linalg.lstsq(w[:, :-1] / norm, w[:, -1], rcond=1e-9)[0] / norm
+    coefficients = solution[-columns.shape[1] :]
+    if effect.site == "gain":
+        return effect
+    return effect.with_linear(jnp.asarray(coefficients))
+
+
+def refit(record: Record, baseline: Estimate, found: list[Found]) -> Estimate | None:
+    """Fit the baseline with everything found; where a shape parameter cannot be estimated it is held at the searched value."""
+    model = baseline.model
+    given = baseline.noise_given
+    for step in found:
+        if step.effect is not None:
+            model = model.with_effect(step.effect)
+    rows = [r for f in found for r in f.rows]
+    data = record.without(np.array(rows)) if rows else record
+    model = GyroModel(model.effects, baseline.model.noise if given else {}, model.fixed, model.gyro)
+    for attempt in (model, _shapes_held(model, found)):
+        try:
+            return fit_record(data, attempt)
+        except EstimateError:
+            continue
+    return None
+
+
+def _shapes_held(model: GyroModel, found: list[Found]) -> GyroModel:
+    held = {
+        (f.effect.label, name)
+        for f in found
+        if f.effect is not None
+        for name, declared in f.effect.declared().items()
+        if not declared.linear
+    }
+    return replace_fixed(model, model.fixed | frozenset(held))
+
+
+def replace_fixed(model: GyroModel, fixed: frozenset[tuple[str, str]]) -> GyroModel:
+    """The model with another set of fixed parameters."""
+    return GyroModel(model.effects, model.noise, fixed, model.gyro)
+
+
+def leave_one_out(
+    record: Record, scanner: Scanner, baseline: Estimate, found: list[Found], i: int
+) -> Ranking | None:
+    """Rank all candidates beside everything found except item i."""
+    others = found[:i] + found[i + 1 :]
+    estimate = refit(record, baseline, others)
+    if estimate is None:
+        return None
+    pulses = tuple(r for f in others for r in f.rows)
+    return rank_where_it_matters(scanner, estimate, pulses)
+
+
+def _exchange(
+    record: Record, scanner: Scanner, baseline: Estimate, found: list[Found], estimate: Estimate
+) -> tuple[list[Found], Estimate]:
+    """Re-choose each earlier addition given all the others."""
+    for i in range(len(found)):
+        if found[i].effect is None:
+            continue
+        ranking = leave_one_out(record, scanner, baseline, found, i)
+        if ranking is None:
+            continue
+        name, score = ranking.best(drivers=False)
+        own = ranking.statistic.get(found[i].name, -np.inf)
+        if name is None or name in (found[i].name, "outliers") or score < own + EXCHANGE:
+            continue
+        others = found[:i] + found[i + 1 :]
+        base = refit(record, baseline, others)
+        if base is None:
+            continue
+        step = _addition(scanner, base, ranking, name, tuple(r for f in others for r in f.rows))
+        changed = [*others[:i], step, *others[i:]]
+        after = refit(record, baseline, changed)
+        if after is not None:
+            found, estimate = changed, after
+    return found, estimate
+

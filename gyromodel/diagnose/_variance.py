@@ -1,0 +1,78 @@
+"""Noise that grows with a driver: a score test on whitened residuals, and the variance function that answers it."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+from gyromodel.estimate import Estimate
+from gyromodel.signals import Record
+
+SIGNIFICANT = 1e-5
+HEAVY = 6.0
+
+
+def variance_drivers(record: Record) -> dict[str, np.ndarray]:
+    """What the noise may grow with, each scaled to 0…1."""
+    found = {}
+    for label, name, form in (
+        ("|rate|", "rate", np.abs),
+        ("temperature", "temperature", np.asarray),
+        ("|temperature rate|", "temperature_rate", np.abs),
+        ("time", "time", np.asarray),
+    ):
+        if name in record.signals:
+            values = form(np.asarray(record.signals[name]))
+            inside = values[: record.rows]
+            if np.isfinite(inside).all() and np.ptp(inside) > 0:
+                found[label] = (values - inside.min()) / np.ptp(inside)
+    return found
+
+
+def growing_noise(record: Record, estimate: Estimate) -> tuple[str, np.ndarray] | None:
+    """The driver that the noise level follows most, with the variance it gives each sample; None where none does."""
+    use = np.isfinite(estimate.whitened)
+    # Large residuals are shortened, so that a few gross errors do not pass for a trend.
+    e = np.minimum(estimate.whitened[use] ** 2, 9.0)
+    best: tuple[float, str, np.ndarray] | None = None
+    drivers = variance_drivers(record)
+    for label, z in drivers.items():
+        x = z[: record.rows][use]
+        statistic = np.corrcoef(x, e)[0, 1] ** 2 * len(e) if e.std() > 0 else 0.0
+        if best is None or statistic > best[0]:
+            best = (statistic, label, z)
+    if best is None or stats.chi2.sf(best[0], 1) * len(drivers) > SIGNIFICANT:
+        return None
+    slope = _log_slope(best[2][: record.rows][use], estimate.whitened[use] ** 2)
+    white = np.exp(slope * (np.clip(best[2], 0.0, 1.0) - best[2][: record.rows][use].mean()))
+    return best[1], np.asarray(record.sampling.white) * white
+
+
+def _log_slope(x: np.ndarray, square: np.ndarray) -> float:
+    """Slope of ln σ² on x by iterated gamma regression."""
+    design = np.column_stack([np.ones_like(x), x])
+    beta = np.array([np.log(square.mean()), 0.0])
+    for _ in range(50):
+        mean = np.exp(np.clip(design @ beta, -30, 30))
+        step = np.linalg.lstsq(design, np.minimum(square, 16 * mean) / mean - 1.0, rcond=None)[0]
+        beta = beta + np.clip(step, -1, 1)
+        if np.abs(step).max() < 1e-6:
+            break
+    return float(np.clip(beta[1], -12, 12))
+
+
+def with_variance(record: Record, white: np.ndarray) -> Record:
+    """The record with another relative white variance of each sample."""
+    return record._replace(sampling=record.sampling._replace(white=jnp.asarray(white)))
+
+
+def tails(estimate: Estimate) -> str | None:
+    """A sentence where whitened residuals have far heavier tails than a normal distribution."""
+    e = estimate.whitened[np.isfinite(estimate.whitened)]
+    if len(e) < 50:
+        return None
+    excess = stats.kurtosis(e)
+    if excess / np.sqrt(24.0 / len(e)) < HEAVY:
+        return None
+    return f"Residuals have heavy tails (excess kurtosis {excess:.1f}): intervals that assume normal noise are optimistic."

@@ -1,0 +1,334 @@
+"""From rankings to a verdict: which names the data support, which they cannot tell apart, and what would settle it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+from gyromodel.diagnose._bank import smooth_columns
+from gyromodel.diagnose._evidence import explained_for
+from gyromodel.diagnose._result import Cause, Confuser, Driver, ParameterValue, Verdict
+from gyromodel.diagnose._scan import Scanner
+from gyromodel.diagnose._search import Found, Ranking, Selection, form_effect, is_driver, leave_one_out
+from gyromodel.effects import Effect
+from gyromodel.estimate import Estimate
+from gyromodel.model import effect_class, parameter_unit
+from gyromodel.signals import Record
+from gyromodel.units import factor, internal_unit
+
+# Share of the posterior that the credible set holds.
+CREDIBLE = 0.95
+# A function of time alone must beat a random walk by this much in one run: no real slow noise is exactly a random walk.
+TIME_MARGIN = 15.0
+# A driver that names leave with more than this share of the structure makes the discrepancy unknown.
+UNKNOWN_SHARE = 0.05
+SLOW_IN_TIME = ("bias_drift", "bias_warmup", "bias_step")
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A verdict with everything that goes with it."""
+
+    verdict: Verdict
+    causes: tuple[Cause, ...]
+    credible_set: dict[str, float]
+    driver: str | None
+    next_test: str | None
+    unexplained: dict[str, float]
+    findings: tuple[str, ...]
+
+
+def credible(ranking: Ranking, name: str, statistic: float, *, runs: int) -> dict[str, float]:
+    """The smallest set of names that holds 95 % of the posterior, for the cause found as `name`; forms of one family merged."""
+    own = {k: v for k, v in ranking.statistic.items() if not is_driver(k) and (k != "outliers" or name == "outliers")}
+    if name in SLOW_IN_TIME and runs < 2 and statistic < TIME_MARGIN and _coloured(ranking):
+        own["noise_random_walk"] = max(0.0, statistic - 1.0)
+    top = max(own.values())
+    weight = {k: float(np.exp(v - top)) for k, v in own.items()}
+    total = sum(weight.values())
+    chosen: dict[str, float] = {}
+    for k in sorted(weight, key=lambda k: -weight[k]):
+        chosen[k] = weight[k] / total
+        if sum(chosen.values()) >= CREDIBLE:
+            break
+    for k in list(chosen):
+        general = [m for m in chosen if m != k and k in _supersedes(m)]
+        if general and k in chosen:
+            loser = min((k, general[0]), key=lambda n: chosen[n])
+            winner = general[0] if loser == k else k
+            chosen[winner] += chosen.pop(loser)
+    return chosen
+
+
+def _supersedes(name: str) -> tuple[str, ...]:
+    if name == "outliers" or name.startswith("noise_"):
+        return ()
+    return effect_class(name).supersedes
+
+
+def _coloured(ranking: Ranking) -> bool:
+    """Whether, with nothing added, the noise would have to be slow."""
+    g = ranking.best_cell()
+    return ranking.slow[g]
+
+
+def judge(
+    record: Record, scanner: Scanner, baseline: Estimate, selection: Selection, trials: int, null_scores: np.ndarray
+) -> Judgement:
+    """The verdict on a finished search."""
+    found = list(selection.found)
+    runs = int(np.asarray(record.sampling.restart).sum())
+    causes, sets, findings = [], [], []
+    for i, step in enumerate(found):
+        ranking = step.ranking if len(found) == 1 else leave_one_out(record, scanner, baseline, found, i) or step.ranking
+        name = step.name
+        statistic = ranking.statistic.get(name, step.ranking.statistic[name])
+        members = credible(ranking, name, statistic, runs=runs)
+        if name == "outliers":
+            if scanner.by_points and _unrepeated(record, step.rows):
+                members = {"outliers": members.get("outliers", 1.0) * 0.5, "scale_spline": 0.5}
+            elif not scanner.by_points:
+                some = ", ".join(str(r + 1) for r in step.rows[:8])
+                findings.append(f"Gross error in data row {some}: given up, not modelled.")
+                continue
+        causes.append(_cause(scanner, selection.estimate, step, ranking, members, statistic, trials, null_scores))
+        sets.append(members)
+    order = sorted(range(len(causes)), key=lambda i: -causes[i].statistic)
+    causes, sets = [causes[i] for i in order], [sets[i] for i in order]
+    driver, share = _remaining(scanner, baseline, selection)
+    unexplained = {" and ".join(smooth_columns(driver)): share} if driver else {}
+    if driver and (not causes or share > UNKNOWN_SHARE):
+        column = smooth_columns(driver)
+        test = f"Vary {' and '.join(column)} alone, in steps up and down, everything else held, and repeat the run."
+        return Judgement("unknown", tuple(causes), {driver: 1.0}, driver, test, unexplained, tuple(findings))
+    if not causes:
+        return Judgement("adequate", (), {}, None, None, unexplained, tuple(findings))
+    if len(sets[0]) > 1:
+        names = list(sets[0])
+        return Judgement(
+            "ambiguous", _as_set(causes[0], sets[0]), sets[0], None, _next_test(names, record, causes[0]), unexplained, tuple(findings)
+        )
+    named = tuple(c for c, s in zip(causes, sets, strict=True) if len(s) == 1)
+    for cause, members in zip(causes, sets, strict=True):
+        if len(members) > 1:
+            others = " or ".join(members)
+            findings.append(f"The extended model also holds {cause.effect}, which this campaign cannot tell from the others of: {others}.")
+    return Judgement("named", named, sets[0], None, None, unexplained, tuple(findings))
+
+
+def _as_set(cause: Cause, members: dict[str, float]) -> tuple[Cause, ...]:
+    others = [Cause(k, (), cause.statistic + np.log(v / members[cause.effect]) if cause.effect in members else cause.statistic,
+                    cause.p_value, cause.p_adjusted, v) for k, v in members.items() if k != cause.effect]
+    return (cause, *others)
+
+
+def _unrepeated(record: Record, rows: tuple[int, ...]) -> bool:
+    """Whether some anomalous point's rate was measured only once, so that a curve through it cannot be excluded."""
+    if "rate" not in record.signals:
+        return True
+    rate = np.asarray(record.signals["rate"])[: record.rows]
+    tolerance = 1e-3 * np.ptp(rate) + 1e-12
+    return any(np.sum(np.abs(rate - rate[r]) < tolerance) < 3 for r in rows)
+
+
+def _next_test(names: list[str], record: Record, cause: Cause) -> str:
+    if "outliers" in names and cause.points and "rate" in record.signals:
+        rate = np.asarray(record.signals["rate"])[list(cause.points)] * factor("rad/s", "deg/s")
+        levels = ", ".join(f"{r:.4g}" for r in sorted(rate))
+        return (
+            f"Repeat the points at {levels} deg/s several times, in both directions and in random order: anomalous test points "
+            "do not come back, a curve does."
+        )
+    if "noise_random_walk" in names:
+        return "Repeat the run: a deterministic change comes back the same, a random walk does not."
+    tests = [effect_class(n).test for n in names if n != "outliers" and not n.startswith("noise_")]
+    return " ".join(dict.fromkeys(tests))
+
+
+def _cause(
+    scanner: Scanner,
+    estimate: Estimate,
+    step: Found,
+    ranking: Ranking,
+    members: dict[str, float],
+    statistic: float,
+    trials: int,
+    null_scores: np.ndarray,
+) -> Cause:
+    name = step.name
+    g = ranking.best_cell(name)
+    result = ranking.results[g]
+    _, explained, q = result.best[name]
+    nu = scanner.degrees_of_freedom
+    p = float(stats.beta.sf(min(explained / result.rss, 1.0), q / 2, max(nu - q, 1) / 2))
+    shapes = len(result.energy.get(name, ())) or 1
+    adjusted = float(min(1.0, p * shapes * trials))
+    if len(null_scores):
+        adjusted = float((1 + np.sum(null_scores >= statistic)) / (1 + len(null_scores)))
+    rivals = sorted((k for k in ranking.statistic if k != name), key=lambda k: -ranking.statistic[k])[:4]
+    confusers = tuple(Confuser(k, s) for k in rivals if (s := _separation(scanner, ranking, name, k)) is not None)
+    if step.rows:
+        parameters = _point_parameters(scanner.record, estimate, step.rows)
+        if "scale_spline" in members:
+            confusers = (Confuser("scale_spline", 0.0), *confusers)
+    else:
+        parameters = tuple(
+            ParameterValue(r.name, r.value, r.std, r.unit) for r in estimate.table() if r.effect == name and r.std > 0 or r.effect == name
+        )
+    return Cause(name, parameters, statistic, p, adjusted, members.get(name, 0.0), confusers, tuple(step.rows))
+
+
+def _point_parameters(record: Record, estimate: Estimate, rows: tuple[int, ...]) -> tuple[ParameterValue, ...]:
+    predicted = np.asarray(estimate.model.predict(record.signals))
+    gain = float(estimate.model.gain())
+    scale = factor("rad/s", "deg/s")
+    found = []
+    for r in sorted(rows):
+        shift = (float(record.signals["output"][r]) - predicted[r]) / gain
+        std = float(np.sqrt(estimate.white_variance)) / abs(gain)
+        rate = float(record.signals["rate"][r]) * scale if "rate" in record.signals else None
+        label = f"shift at {rate:.4g} deg/s" if rate is not None else f"shift at data row {r + 1}"
+        found.append(ParameterValue(label, shift * scale, std * scale, "deg/s"))
+    return tuple(found)
+
+
+def _columns(scanner: Scanner, ranking: Ranking, name: str) -> np.ndarray | None:
+    if name not in ranking.results[ranking.best_cell(name)].best:
+        return None
+    form, _, _ = ranking.best_form(name)
+    if name == "outliers":
+        rows = form if isinstance(form, tuple) else (form,)
+        marks = np.zeros((len(scanner.present), len(rows)))
+        marks[list(rows), np.arange(len(rows))] = 1.0
+        return marks
+    assert isinstance(form, int)
+    effect = form_effect(scanner, name, form)
+    if name in ("bias_step", "bias_periodic"):
+        assert effect is not None
+        return np.asarray(effect.columns(scanner.record.signals))
+    block = scanner.bank.blocks[form]
+    return scanner.bank.columns[:, block.start : block.start + block.width]
+
+
+def _separation(scanner: Scanner, ranking: Ranking, a: str, b: str) -> float | None:
+    """Sine of the smallest principal angle between two candidates' whitened, projected columns, in the noise of the first."""
+    first, second = _columns(scanner, ranking, a), _columns(scanner, ranking, b)
+    if first is None or second is None:
+        return None
+    g = ranking.best_cell(a)
+    w = scanner.whiten(g, jnp.asarray(np.concatenate([ranking.baseline_columns, first, second], axis=1)))
+    p = ranking.baseline_columns.shape[1]
+    base = w[:, :p] / np.maximum(np.linalg.norm(w[:, :p], axis=0), 1e-300)
+    rest = w[:, p:] - base @ np.linalg.lstsq(base, w[:, p:], rcond=1e-10)[0]
+    qa, qb = (_basis(x) for x in (rest[:, : first.shape[1]], rest[:, first.shape[1] :]))
+    if not qa.shape[1] or not qb.shape[1]:
+        return None
+    # The smaller space measured against the larger one.
+    cosine = np.linalg.svd(qa.T @ qb, compute_uv=False)
+    return float(np.sqrt(max(0.0, 1.0 - min(1.0, cosine[: min(qa.shape[1], qb.shape[1])].max()) ** 2)))
+
+
+def _basis(x: np.ndarray) -> np.ndarray:
+    u, s, _ = np.linalg.svd(x / np.maximum(np.linalg.norm(x, axis=0), 1e-300), full_matrices=False)
+    return u[:, s > 1e-5]
+
+
+def _remaining(scanner: Scanner, baseline: Estimate, selection: Selection) -> tuple[str | None, float]:
+    """The driver that is still significant, and its share of all the structure that names and driver explain."""
+    driver = selection.driver
+    if driver is None:
+        return None, 0.0
+    g = selection.last.best_cell(driver)
+    left = selection.last.best_form(driver)[1]
+    record = scanner.record
+    residuals = []
+    for estimate in (baseline, selection.estimate):
+        predicted, jacobian = estimate.model.linearise(record.signals)
+        gain = float(estimate.model.gain())
+        y = jnp.where(record.sampling.present, record.signals["output"] - predicted, 0.0) / gain
+        marks = np.zeros((len(scanner.present), 0))
+        rows = [r for f in selection.found for r in f.rows]
+        if rows:
+            marks = np.zeros((len(scanner.present), len(rows)))
+            marks[rows, np.arange(len(rows))] = 1.0
+        w = scanner.whiten(g, jnp.column_stack([jacobian, jnp.asarray(marks), y]))
+        base = w[:, :-1] / np.maximum(np.linalg.norm(w[:, :-1], axis=0), 1e-300)
+        residuals.append(float(np.sum((w[:, -1] - base @ np.linalg.lstsq(base, w[:, -1], rcond=1e-10)[0]) ** 2)))
+    named = max(residuals[0] - residuals[1], 0.0)
+    return driver, left / (left + named)
+
+
+def driver_shape(scanner: Scanner, selection: Selection, name: str, unit: str) -> Driver:
+    """The smooth function behind an unknown discrepancy, at the measured points in order of its first column, with its band."""
+    ranking = selection.last
+    columns = _columns(scanner, ranking, name)
+    assert columns is not None
+    record, estimate = scanner.record, selection.estimate
+    predicted, jacobian = estimate.model.linearise(record.signals)
+    gain = float(estimate.model.gain())
+    y = jnp.where(record.sampling.present, record.signals["output"] - predicted, 0.0) / gain
+    g = ranking.best_cell(name)
+    w = scanner.whiten(g, jnp.column_stack([jacobian / gain, jnp.asarray(columns), y]))
+    p = jacobian.shape[1]
+    norm = np.maximum(np.linalg.norm(w[:, :-1], axis=0), 1e-300)
+    u, s, vt = np.linalg.svd(w[:, :-1] / norm, full_matrices=False)
+    keep = s > 1e-5 * s[0]
+    inverse = vt[keep].T / s[keep]
+    solution = inverse @ (u[:, keep].T @ w[:, -1])
+    variance = float(np.sum((w[:, -1] - w[:, :-1] @ (solution / norm)) ** 2)) / max(scanner.degrees_of_freedom, 1)
+    covariance = inverse @ inverse.T * variance
+    shape = columns[: record.rows] / norm[p:]
+    shape = shape - shape.mean(0)
+    value = shape @ solution[p:]
+    std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", shape, covariance[p:, p:], shape), 0.0))
+    column = smooth_columns(name)[0]
+    file_unit = record.units.get(column, "s")
+    x = np.asarray(record.signals[column])[: record.rows]
+    order = np.argsort(x)[:: max(1, record.rows // 300)]
+    scale = factor("rad/s", unit)
+    label = " and ".join(smooth_columns(name))
+    from gyromodel.units import from_internal
+
+    return Driver(label, file_unit, from_internal(x[order], file_unit), value[order] * scale, std[order] * scale, unit)
+
+
+def minimum_detectable(scanner: Scanner, ranking: Ranking, threshold: float, unit: str) -> dict[str, tuple[float, str]]:
+    """Size of each searched effect that would have been found with 80 % probability, at the noise of the final fit."""
+    g = ranking.best_cell()
+    result = ranking.results[g]
+    nu = scanner.degrees_of_freedom
+    sigma = np.sqrt(result.rss / nu)
+    sizes: dict[str, tuple[float, str]] = {}
+    widths = {b.name: b for b in reversed(scanner.bank.blocks)}
+    for name, energy in result.energy.items():
+        energy = energy[energy > 0]
+        if is_driver(name) or name == "outliers" or not len(energy):
+            continue
+        q = widths[name].width if name in widths else (2 if name == "bias_periodic" else 1)
+        needed = np.sqrt(explained_for(threshold + np.log(len(energy)), nu, q)) + 0.84
+        size = float(needed * sigma / np.sqrt(np.median(energy)))
+        sizes[name] = _in_unit(scanner, name, widths[name].effect if name in widths else None, q, size, unit)
+    return sizes
+
+
+def _in_unit(scanner: Scanner, name: str, effect: Effect | None, q: int, size: float, unit: str) -> tuple[float, str]:
+    effect = effect if effect is not None else form_effect(scanner, name, 1)
+    assert effect is not None
+    if effect.site == "gain":
+        return size / factor("ppm", "1"), "ppm"
+    field = next(k for k, d in effect.declared().items() if d.linear)
+    declared = parameter_unit(effect, field, scanner.record.output_unit, scanner.record.units)
+    return size * factor(internal_unit(declared), declared), declared
+
+
+def testable(scanner: Scanner, ranking: Ranking) -> dict[str, str]:
+    """Candidates whose columns vanish beside the model, with the reason."""
+    result = ranking.results[ranking.best_cell()]
+    return {
+        name: "cannot be told from what the model already has on this campaign"
+        for name in {b.name for b in scanner.bank.blocks if b.kind == "effect"}
+        if name not in result.evidence and not (result.energy.get(name, np.zeros(1)) > 0).any()
+    }

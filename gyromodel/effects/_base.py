@@ -1,0 +1,160 @@
+"""`Effect`: one physical error source, as columns for its linear coefficients; and the registry that finds them all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, Literal, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+Signals = Mapping[str, Float[Array, " sample"]]
+Site = Literal["gain", "scale", "rate"]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """What a parameter field declares."""
+
+    unit: str
+    typical: float
+    meaning: str
+    linear: bool
+
+
+def parameter(unit: str, typical: float, meaning: str, *, linear: bool = True, default: Any = 0.0) -> Any:
+    """Declare a parameter field.
+
+    Args:
+        unit: unit of the value in files and reports.
+        typical: usual size in that unit; scales priors and steps.
+        meaning: one line.
+        linear: whether the contribution is linear in it; a nonlinear one shapes the columns.
+        default: start value; zero for an amplitude, so that the effect is absent until fitted.
+    """
+    return eqx.field(
+        converter=lambda v: jnp.asarray(v, float),
+        default_factory=lambda: default,
+        metadata={"parameter": Parameter(unit, typical, meaning, linear)},
+    )
+
+
+CATALOGUE: dict[str, type[Effect]] = {}
+
+
+class Effect(eqx.Module):
+    """One additive term of the gyro model.
+
+    `site` says where it acts in output = gain · (rate + Σ rate terms) · (1 + Σ scale terms). Fields declared with
+    `parameter` are its parameters. `columns` returns one column per linear coefficient, in field order, and may depend on
+    the nonlinear ones; the contribution is columns @ coefficients, so zero coefficients are exactly the model without it.
+    `supersedes` lists effects that this one contains as a special case; `held` the fields that physics
+    or the search fixes; `positive` says that the (only) coefficient cannot be negative; `scan` names a fast search over
+    every epoch or frequency.
+    """
+
+    id: ClassVar[str]
+    site: ClassVar[Site]
+    needs: ClassVar[tuple[str, ...]]
+    cause: ClassVar[str]
+    test: ClassVar[str]
+    supersedes: ClassVar[tuple[str, ...]] = ()
+    held: ClassVar[tuple[str, ...]] = ()
+    positive: ClassVar[bool] = False
+    scan: ClassVar[Literal["", "step", "line"]] = ""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "id" in cls.__dict__:
+            CATALOGUE[cls.id] = cls
+
+    @property
+    def label(self) -> str:
+        """The public id of this instance."""
+        return self.id
+
+    @property
+    def columns_needed(self) -> tuple[str, ...]:
+        """The campaign columns this instance reads."""
+        return self.needs
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """Columns of the linear coefficients, each the contribution per unit coefficient in internal units."""
+        raise NotImplementedError
+
+    def prepared(self, signals: Signals) -> Self:
+        """A copy with reference points and start values that depend on the campaign filled in."""
+        return self
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """The forms the search tries, at zero amplitude: every variant, every grid point of the nonlinear parameters."""
+        return [cls().prepared(signals)]
+
+    @classmethod
+    def declared(cls) -> dict[str, Parameter]:
+        """Parameter declarations by field name."""
+        return {f.name: f.metadata["parameter"] for f in fields(cls) if "parameter" in f.metadata}
+
+    def settled(self) -> Self:
+        """The form to fit once the search has chosen this one; fields in `held` are left as they are here."""
+        return self
+
+    def linear(self) -> Float[Array, " coefficient"]:
+        """Linear coefficients, flattened in field order."""
+        values = [jnp.ravel(getattr(self, k)) for k, p in self.declared().items() if p.linear]
+        return jnp.concatenate(values) if values else jnp.zeros(0)
+
+    def with_linear(self, coefficients: Float[Array, " coefficient"]) -> Self:
+        """The same shapes at other linear coefficients."""
+        changed, start = self, 0
+        for name, declared in self.declared().items():
+            if declared.linear:
+                old = getattr(self, name)
+                new = jnp.reshape(jnp.asarray(coefficients)[start : start + jnp.size(old)], jnp.shape(old))
+                changed = eqx.tree_at(lambda e, name=name: getattr(e, name), changed, new)
+                start += jnp.size(old)
+        return changed
+
+    def contribution(self, signals: Signals) -> Float[Array, " sample"]:
+        """The effect's term, in rad/s for site "rate", dimensionless for "scale"."""
+        return self.columns(signals) @ self.linear()
+
+
+@eqx.filter_jit
+def evaluate(
+    effect: Effect, signals: Signals
+) -> tuple[Float[Array, "sample coefficient"], Float[Array, "sample shape"], Float[Array, " sample"]]:
+    """An effect's columns, the derivative of its contribution by its nonlinear parameters, and the contribution itself.
+
+    Compiled once per effect class and shape, whatever model the effect stands in.
+    """
+    columns = effect.columns(signals)
+    derivatives = []
+    for name, declared in effect.declared().items():
+        if declared.linear:
+            continue
+        value = getattr(effect, name)
+
+        def moved(v, name=name):
+            return eqx.tree_at(lambda e: getattr(e, name), effect, jnp.reshape(v, jnp.shape(value))).contribution(signals)
+
+        for direction in jnp.eye(jnp.size(value)):
+            derivatives.append(jax.jvp(moved, (jnp.ravel(value),), (direction,))[1])
+    rows = columns.shape[0]
+    shapes = jnp.stack(derivatives, axis=1) if derivatives else jnp.zeros((rows, 0))
+    return columns, shapes, columns @ effect.linear()
+
+
+def stack(*columns: Float[Array, " sample"]) -> Float[Array, "sample coefficient"]:
+    """Columns side by side."""
+    return jnp.stack(columns, axis=1)
+
+
+def round_reference(values: Float[Array, " sample"], step: float = 1.0) -> Float[Array, ""]:
+    """Mean rounded to a readable reference point."""
+    return jnp.asarray(np.round(float(np.nanmean(np.asarray(values))) / step) * step)

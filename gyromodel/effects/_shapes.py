@@ -1,0 +1,35 @@
+"""Column shapes that several effects share."""
+
+from __future__ import annotations
+
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+# Powers are of (x − reference)/10, so that their coefficients have the size of the effect over ten degrees.
+POWER_SCALE = 10.0
+
+
+def curve_columns(
+    x: Float[Array, " sample"], reference: Float[Array, ""], powers: int, breakpoints: Float[Array, " hinge"]
+) -> Float[Array, "sample column"]:
+    """Powers 1…`powers` of (x − reference)/10, then max(x − breakpoint, 0) for each breakpoint."""
+    u = (x - reference) / POWER_SCALE
+    columns = [u**i for i in range(1, powers + 1)]
+    columns += [jnp.maximum(x - breakpoints[j], 0.0) for j in range(breakpoints.shape[0])]
+    return jnp.stack(columns, axis=1)
+
+
+def curve_forms(x: Float[Array, " sample"]) -> list[dict[str, np.ndarray]]:
+    """Zero-amplitude forms of a curve: quadratic, cubic, a line with one hinge, a line with two."""
+    low, high = float(jnp.nanmin(x)), float(jnp.nanmax(x))
+    if not high > low:
+        return []
+    one = np.linspace(low, high, 13)[1:-1]
+    two = list(itertools.combinations(np.linspace(low, high, 8)[1:-1], 2))
+    forms = [{"coefficients": np.zeros(order)} for order in (2, 3)]
+    for breaks in [(b,) for b in one] + two:
+        forms.append({"coefficients": np.zeros(1), "hinges": np.zeros(len(breaks)), "breakpoints": np.array(breaks)})
+    return forms

@@ -1,0 +1,127 @@
+"""Bias effects of time and of any other measured column."""
+
+from __future__ import annotations
+
+from typing import Self
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from gyromodel.effects._base import Effect, Signals, parameter, stack
+
+
+class Bias(Effect):
+    """D += D_F: constant bias."""
+
+    id = "bias"
+    site = "rate"
+    needs = ()
+    cause = "The gyro reads a rate at rest."
+    test = "Any covariate that stays constant looks the same: vary it."
+
+    value: Float[Array, ""] = parameter("deg/h", 1.0, "output at rest, as a rate")
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """Ones."""
+        return stack(jnp.ones_like(signals["time"]))
+
+
+class BiasDrift(Effect):
+    """D += R t: bias drifting in proportion to time."""
+
+    id = "bias_drift"
+    site = "rate"
+    needs = ("time",)
+    cause = "Ageing, outgassing or slow relaxation."
+    test = "Repeat the run: a drift returns with the same slope, a random walk does not."
+
+    slope: Float[Array, ""] = parameter("deg/h/h", 0.1, "bias change per unit of time")
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """Time since the start."""
+        return stack(signals["time"])
+
+
+class BiasStep(Effect):
+    """D += Δ·1(t ≥ t_k): the bias jumps once."""
+
+    id = "bias_step"
+    site = "rate"
+    needs = ("time",)
+    cause = "A mode hop, a range switch or a mechanical shift."
+    test = "Repeat the run and look for the same event in a monitor channel: a random walk leaves none."
+
+    held = ("epoch",)
+    scan = "step"
+    size: Float[Array, ""] = parameter("deg/h", 1.0, "bias after minus before")
+    epoch: Float[Array, ""] = parameter("s", 1.0, "when it happens, from the start", linear=False, default=0.0)
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """One from the epoch on."""
+        return stack((signals["time"] >= self.epoch).astype(float))
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """Scanned at every epoch by the search."""
+        return []
+
+
+class BiasPeriodic(Effect):
+    """D += A cos 2πft + B sin 2πft: a line at an unknown frequency."""
+
+    id = "bias_periodic"
+    site = "rate"
+    needs = ("time",)
+    cause = "Aliased dither, mains pick-up, chamber cycling or table harmonics."
+    test = "Change the sample rate: an alias moves; log the chamber's cycle: its line is coherent with temperature."
+
+    scan = "line"
+    cosine: Float[Array, ""] = parameter("deg/h", 1.0, "in-phase amplitude")
+    sine: Float[Array, ""] = parameter("deg/h", 1.0, "quadrature amplitude")
+    frequency: Float[Array, ""] = parameter("Hz", 0.01, "frequency", linear=False, default=0.01)
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """Cosine and sine."""
+        phase = 2.0 * jnp.pi * self.frequency * signals["time"]
+        return stack(jnp.cos(phase), jnp.sin(phase))
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """Scanned at every frequency by the search."""
+        return []
+
+
+class BiasColumn(Effect):
+    """D += D_X (X − X0): bias proportional to another measured column X; its id is bias_<column>."""
+
+    id = "bias_column"
+    site = "rate"
+    needs = ()
+    cause = "Supply, pressure, magnetic field or whatever the column measures leaks into the output."
+    test = "Step that column alone, all others held."
+
+    coefficient: Float[Array, ""] = parameter("deg/h", 1.0, "bias per unit of the column, in the column's unit")
+    column: str = eqx.field(static=True, default="")
+    reference: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(jnp.nan), converter=jnp.asarray)
+
+    @property
+    def label(self) -> str:
+        """bias_<column>."""
+        return f"bias_{self.column}"
+
+    @property
+    def columns_needed(self) -> tuple[str, ...]:
+        """The driving column."""
+        return (self.column,)
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """X − X0."""
+        return stack(signals[self.column] - self.reference)
+
+    def prepared(self, signals: Signals) -> Self:
+        """Refer to the column's mean."""
+        if np.isfinite(float(self.reference)):
+            return self
+        return eqx.tree_at(lambda e: e.reference, self, jnp.nanmean(signals[self.column]))

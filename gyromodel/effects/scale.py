@@ -1,0 +1,225 @@
+"""Scale-factor effects: the gain itself and the terms of its relative error."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Self
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from gyromodel.effects._base import Effect, Signals, parameter, round_reference, stack
+from gyromodel.effects._shapes import curve_columns, curve_forms
+
+
+class ScaleFactor(Effect):
+    """output = S0 · (rate + …): the gain from input rate to output."""
+
+    id = "scale_factor"
+    site = "gain"
+    needs = ("rate",)
+    cause = "The optical or mechanical gain differs from the nominal one."
+    test = "Calibrate the rate table against a second reference: its rate error looks the same."
+
+    value: Float[Array, ""] = parameter("1", 1.0, "output per unit of input rate", default=jnp.nan)
+
+    def prepared(self, signals: Signals) -> Self:
+        """Start at the slope of output over rate."""
+        if np.isfinite(float(self.value)):
+            return self
+        rate, output = (np.asarray(signals[k]) for k in ("rate", "output"))
+        good = np.isfinite(output)
+        centred = rate[good] - rate[good].mean()
+        energy = float(centred @ centred)
+        slope = float(centred @ output[good]) / energy if energy > 0 else 1.0
+        return type(self)(value=slope if slope != 0 else 1.0)
+
+
+class ScaleAsymmetry(Effect):
+    """ε += ½ ε_a sgn(rate): the scale factor differs between the two senses of rotation."""
+
+    id = "scale_asymmetry"
+    site = "scale"
+    needs = ("rate",)
+    cause = "The torquer or the optical path responds differently to the two senses of rotation."
+    test = "At least three rates of each sign, and rest: an even nonlinearity bends, an asymmetry does not."
+
+    difference: Float[Array, ""] = parameter("ppm", 100.0, "scale factor at positive minus at negative rates")
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """Half the sign of the rate."""
+        return stack(0.5 * jnp.sign(signals["rate"]))
+
+
+class ScaleNonlinearity(Effect):
+    """rate·ε = Σ k_i rate^i, i = 2…5: polynomial output error."""
+
+    id = "scale_nonlinearity"
+    site = "scale"
+    needs = ("rate",)
+    cause = "The readout electronics, the modulation depth or the table response bends the input-output curve."
+    test = "Run the rates in random order: self-heating at speed follows time, a nonlinearity follows rate."
+
+    coefficients: Float[Array, " term"] = parameter("ppm", 100.0, "each power's part of the output at full_rate, of it")
+    powers: tuple[int, ...] = eqx.field(static=True, default=(2, 3, 4, 5))
+    full_rate: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(jnp.nan), converter=jnp.asarray)
+
+    def __post_init__(self) -> None:
+        if np.ndim(self.coefficients) == 0:
+            self.coefficients = jnp.zeros(len(self.powers))
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """(rate/full_rate)^(i-1): times the rate, the output error of power i."""
+        x = signals["rate"] / self.full_rate
+        return stack(*(x ** (i - 1) for i in self.powers))
+
+    def prepared(self, signals: Signals) -> Self:
+        """Express the coefficients at the largest rate of the campaign."""
+        if np.isfinite(float(self.full_rate)):
+            return self
+        return eqx.tree_at(lambda e: e.full_rate, self, jnp.max(jnp.abs(signals["rate"])))
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """Every set of powers."""
+        sets = [s for r in (1, 2, 3, 4) for s in itertools.combinations((2, 3, 4, 5), r)]
+        return [cls(powers=s).prepared(signals) for s in sets]
+
+
+class ScaleSagnacSine(Effect):
+    """ε += a·[sin(κ·rate) − κ·rate]/(κ·rate): the sine of an open-loop interferometer, a = 1.
+
+    The search lets a vary to have a linear coefficient; the fit holds it at one and estimates κ.
+    """
+
+    id = "scale_sagnac_sine"
+    site = "scale"
+    needs = ("rate",)
+    cause = "An open-loop fiber-optic gyro measures the sine of the Sagnac phase, and the simulation has it linear."
+    held = ("share",)
+    positive = True
+    test = "Drive it to rates where the Sagnac phase passes 1 rad: a cubic nonlinearity parts from the sine there."
+
+    share: Float[Array, ""] = parameter("1", 1.0, "part of the output that follows the sine", default=1.0)
+    kappa: Float[Array, ""] = parameter("s/rad", 0.1, "Sagnac phase per unit rate", linear=False, default=0.1)
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """sinc(κ·rate) − 1, by its series near zero."""
+        phase = self.kappa * signals["rate"]
+        small = jnp.abs(phase) < 1e-2
+        safe = jnp.where(small, 1.0, phase)
+        series = -(phase**2) / 6.0 + phase**4 / 120.0
+        return stack(jnp.where(small, series, jnp.sin(safe) / safe - 1.0))
+
+    def settled(self) -> Self:
+        """Full sine, with the κ that has the same cubic term."""
+        kappa = self.kappa * jnp.sqrt(jnp.maximum(self.share, 1e-6))
+        return type(self)(share=1.0, kappa=kappa)
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """Sagnac phases of 0.1 to 3 rad at the largest rate."""
+        top = float(jnp.max(jnp.abs(signals["rate"])))
+        return [cls(kappa=phase / top) for phase in np.geomspace(0.1, 3.0, 12)] if top > 0 else []
+
+
+class ScaleTemperature(Effect):
+    """ε += ε_T (T − T0): scale factor proportional to temperature."""
+
+    id = "scale_temperature"
+    site = "scale"
+    needs = ("rate", "temperature")
+    cause = "Wavelength, coil area, magnet strength or electronics gain change with temperature."
+    test = "Positive and negative rates at each temperature: a bias over temperature does not change sign."
+
+    coefficient: Float[Array, ""] = parameter("ppm/degC", 10.0, "relative change per degree")
+    reference: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(jnp.nan), converter=jnp.asarray)
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """T − T0."""
+        return stack(signals["temperature"] - self.reference)
+
+    def prepared(self, signals: Signals) -> Self:
+        """Refer to the campaign's mean temperature."""
+        if np.isfinite(float(self.reference)):
+            return self
+        return eqx.tree_at(lambda e: e.reference, self, round_reference(signals["temperature"]))
+
+
+class ScaleTemperatureCurve(Effect):
+    """ε += Σ a_i (T − T0)^i + Σ h_j max(T − T_j, 0): scale factor curved over temperature."""
+
+    id = "scale_temperature_curve"
+    site = "scale"
+    needs = ("rate", "temperature")
+    cause = "Source wavelength, optical power or magnet strength bend over temperature or change regime."
+    test = "An independent thermometer: a thermometer error puts the same ripple into every term."
+    supersedes = ("scale_temperature",)
+
+    coefficients: Float[Array, " order"] = parameter("ppm", 100.0, "power i: part per (10 °C)^i")
+    hinges: Float[Array, " hinge"] = parameter("ppm/degC", 10.0, "change of slope at each breakpoint", default=())
+    breakpoints: Float[Array, " hinge"] = parameter("degC", 10.0, "where the slope changes", linear=False, default=())
+    reference: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(jnp.nan), converter=jnp.asarray)
+
+    def __post_init__(self) -> None:
+        if np.ndim(self.coefficients) == 0:
+            self.coefficients = jnp.zeros(2)
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """Powers, then hinges."""
+        powers = self.coefficients.shape[0]
+        return curve_columns(signals["temperature"], self.reference, powers, self.breakpoints)
+
+    def prepared(self, signals: Signals) -> Self:
+        """Refer to the campaign's mean temperature."""
+        if np.isfinite(float(self.reference)):
+            return self
+        return eqx.tree_at(lambda e: e.reference, self, round_reference(signals["temperature"]))
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """Quadratic, cubic, one hinge, two hinges."""
+        return [cls(**form).prepared(signals) for form in curve_forms(signals["temperature"])]
+
+
+class ScaleSpline(Effect):
+    """rate·ε = s(rate), a natural cubic spline with its straight line taken out."""
+
+    id = "scale_spline"
+    site = "rate"
+    needs = ("rate",)
+    cause = "The input-output curve bends in a way that no low power of the rate describes."
+    test = "Repeat the rates in both directions and random order: anomalous test points and resonances do not come back alike."
+    supersedes = ("scale_nonlinearity",)
+
+    coefficients: Float[Array, " bend"] = parameter("ppm", 100.0, "bends, as parts of full_rate")
+    knots: int = eqx.field(static=True, default=6)
+    full_rate: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(jnp.nan), converter=jnp.asarray)
+    lowest: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(jnp.nan), converter=jnp.asarray)
+
+    def __post_init__(self) -> None:
+        if np.ndim(self.coefficients) == 0:
+            self.coefficients = jnp.zeros(self.knots - 2)
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """Truncated cubes that are straight outside the outer knots; knots are even from `lowest` to `full_rate`."""
+        places = jnp.linspace(0.0, 1.0, self.knots)
+        u = (signals["rate"] - self.lowest) / (self.full_rate - self.lowest)
+        cube = jnp.maximum(u[:, None] - places, 0.0) ** 3
+        part = (cube[:, :-1] - cube[:, -1:]) / (1.0 - places[:-1])
+        return (part[:, :-1] - part[:, -1:]) * self.full_rate
+
+    def prepared(self, signals: Signals) -> Self:
+        """Spread the knots over the campaign's rates."""
+        if np.isfinite(float(self.full_rate)):
+            return self
+        ends = jnp.max(signals["rate"]), jnp.min(signals["rate"])
+        return eqx.tree_at(lambda e: (e.full_rate, e.lowest), self, ends)
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """Smooth curves of five to seven knots, where there are rates enough."""
+        levels = len(np.unique(np.round(np.asarray(signals["rate"]), 9)))
+        return [cls(knots=k).prepared(signals) for k in (5, 6, 7) if levels >= 2 * k]

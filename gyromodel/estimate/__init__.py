@@ -1,0 +1,6 @@
+"""Joint generalised least squares with the noise estimated alongside; estimates carry their covariance."""
+
+from gyromodel.estimate._estimate import Estimate, EstimateError
+from gyromodel.estimate._fit import filter_of, fit, fit_record, make_filter, whiten_columns
+
+__all__ = ["Estimate", "EstimateError", "filter_of", "fit", "fit_record", "make_filter", "whiten_columns"]

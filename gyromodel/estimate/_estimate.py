@@ -1,0 +1,127 @@
+"""`Estimate`: a fitted model with its covariance, noise, residuals and identifiability."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from gyromodel.model import GyroModel, parameter_unit
+from gyromodel.noise import NOISE_UNITS, NoiseRatios, coefficients
+from gyromodel.signals import Record
+from gyromodel.units import factor, internal_unit
+
+
+class EstimateError(ValueError):
+    """The data cannot determine what was asked; the message names the effects and what to do."""
+
+
+class ParameterRow(NamedTuple):
+    """One fitted parameter in its reporting unit."""
+
+    effect: str
+    name: str
+    value: float
+    std: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A fitted model.
+
+    Attributes:
+        model: at the estimate; its noise coefficients are filled in.
+        covariance: of the free parameters in the order of `model.slots()`, internal units.
+        degrees_of_freedom: samples present less free parameters.
+        residual: measured minus predicted output, internal output unit; NaN where missing.
+        whitened: residual whitened to unit variance; NaN where missing.
+        ratios: flicker and walk relative to the white variance.
+        white_variance: variance of the white noise of one sample, output unit squared.
+        noise_interval: 95 % interval of each noise coefficient, internal rate units.
+        log_likelihood: restricted, at the estimate.
+        noise_given: whether the model stated its noise.
+    """
+
+    model: GyroModel
+    covariance: np.ndarray = field(repr=False)
+    degrees_of_freedom: int
+    residual: np.ndarray = field(repr=False)
+    whitened: np.ndarray = field(repr=False)
+    ratios: NoiseRatios = field(repr=False)
+    white_variance: float
+    log_likelihood: float
+    converged: bool
+    iterations: int
+    record: Record = field(repr=False)
+    noise_given: bool = False
+    noise_interval: Mapping[str, tuple[float, float]] = field(default_factory=dict, repr=False)
+
+    @property
+    def std(self) -> np.ndarray:
+        """Standard uncertainties, in the order of `model.slots()`, internal units."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def table(self) -> tuple[ParameterRow, ...]:
+        """Every parameter in its reporting unit; those held fixed have standard uncertainty zero."""
+        spread = {(s.effect, s.field, s.index): sd for s, sd in zip(self.model.slots(), self.std, strict=True)}
+        rows = []
+        for i, effect in enumerate(self.model.effects):
+            for name in effect.declared():
+                unit = parameter_unit(effect, name, self.record.output_unit, self.record.units)
+                scale = factor(internal_unit(unit), unit)
+                values = np.ravel(getattr(effect, name))
+                for j, value in enumerate(values):
+                    shown = name if len(values) == 1 else f"{name}[{j}]"
+                    rows.append(ParameterRow(effect.label, shown, value * scale, spread.get((i, name, j), 0.0) * scale, unit))
+        return tuple(rows)
+
+    def noise_table(self) -> dict[str, dict[str, float | str]]:
+        """Noise coefficients with their 95 % intervals, in reporting units."""
+        rows: dict[str, dict[str, float | str]] = {}
+        for name, coefficient in self.model.noise.items():
+            value = float(coefficient)
+            unit = NOISE_UNITS[name]
+            scale = factor(internal_unit(unit), unit)
+            low, high = self.noise_interval.get(name, (value, value))
+            rows[name] = {"value": value * scale, "lo": low * scale, "hi": high * scale, "unit": unit}
+        return rows
+
+    def propagate(self, function: Callable[[GyroModel], Float[Array, "*out"]]) -> tuple[np.ndarray, np.ndarray]:
+        """A differentiable function of the model with its covariance, to first order.
+
+        Args:
+            function: maps a model to an array.
+
+        Returns:
+            The value and the covariance of its flattened entries.
+        """
+        x = self.model.vector()
+
+        def of_vector(v):
+            return jnp.ravel(jnp.asarray(function(self.model.with_vector(v))))
+
+        jacobian = np.asarray(jax.jacfwd(of_vector)(x))
+        return np.asarray(function(self.model)), jacobian @ self.covariance @ jacobian.T
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready summary."""
+        return {
+            "parameters": [row._asdict() for row in self.table()],
+            "noise": self.noise_table(),
+            "degrees_of_freedom": self.degrees_of_freedom,
+            "converged": self.converged,
+            "iterations": self.iterations,
+            "samples": int(self.record.present.sum()),
+            "missing": int(self.record.rows - self.record.present.sum()),
+        }
+
+
+def noise_coefficients(ratios: NoiseRatios, white_variance: float, record: Record, gain: float) -> dict[str, float]:
+    """Noise coefficients as input rates."""
+    return coefficients(ratios, white_variance / gain**2, record.interval)

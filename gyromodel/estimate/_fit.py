@@ -1,0 +1,281 @@
+"""Joint fit of all parameters by generalised least squares, the noise by restricted likelihood, in turns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gyromodel.campaign import Campaign
+from gyromodel.estimate._estimate import Estimate, EstimateError, noise_coefficients
+from gyromodel.estimate._optimistix import optimistix_solution
+from gyromodel.model import GyroModel, ModelError, record_span
+from gyromodel.noise import NoiseRatios, markov_sum, noise_grid, restricted_likelihood
+from gyromodel.numerics.least_squares import Normal, Solution, levenberg_marquardt
+from gyromodel.numerics.state_space import Filter, build_filter, whiten
+from gyromodel.signals import Record, read_signals
+
+Solver = Literal["levenberg_marquardt", "optimistix"]
+Progress = Callable[[str, float], None] | None
+
+# Relative size of a singular value of the whitened, column-scaled Jacobian below which a direction is not determined.
+SINGULAR = 1e-7
+
+
+def fit(
+    campaigns: Campaign | Sequence[Campaign],
+    model: GyroModel,
+    *,
+    solver: Solver = "levenberg_marquardt",
+    progress: Progress = None,
+) -> Estimate:
+    """Fit all free parameters of a model to one unit's campaigns together.
+
+    Args:
+        campaigns: measured data of one unit.
+        model: what to fit; `noise` empty estimates white noise, flicker and random walk alongside.
+        solver: the package's own solver, or optimistix's.
+        progress: called with a line and the fraction done.
+
+    Raises:
+        EstimateError: the campaign does not determine some combination of parameters.
+        ModelError: the model needs columns the campaign lacks.
+    """
+    record = read_signals(campaigns)
+    if progress:
+        progress("fitting", 0.1)
+    estimate = fit_record(record, model, solver=solver, intervals=True)
+    if progress:
+        progress("fitted", 1.0)
+    return estimate
+
+
+def fit_record(
+    record: Record,
+    model: GyroModel,
+    *,
+    ratios: NoiseRatios | None = None,
+    solver: Solver = "levenberg_marquardt",
+    intervals: bool = False,
+) -> Estimate:
+    """As `fit`, on signals already read; `ratios` holds the noise ratios fixed."""
+    if not jnp.zeros(()).dtype == jnp.float64:
+        raise EstimateError("JAX runs in single precision; import gyromodel before using jax, or set JAX_ENABLE_X64=1")
+    model = model.prepared(record.signals)
+    check_covariates(record, model)
+    if record.present.sum() <= len(model.slots()) + 1:
+        raise EstimateError(
+            f"{int(record.present.sum())} samples cannot determine {len(model.slots())} parameters and their noise"
+        )
+    given = given_ratios(record, model) if ratios is None else ratios
+    now = given if given is not None else NoiseRatios(jnp.zeros(()), jnp.zeros(()))
+    x, solution = np.asarray(model.vector()), None
+    for turn in range(1 if given is not None else 4):
+        solution = solve(model, x, record, now, solver)
+        x = solution.x
+        if given is not None:
+            break
+        fitted = model.with_vector(jnp.asarray(x))
+        before = now
+        now = best_ratios(record, fitted, coarse=turn == 0, start=now)
+        if turn and _close(before, now):
+            break
+    assert solution is not None
+    if given is None:
+        solution = solve(model, x, record, now, solver)
+    return _finish(record, model.with_vector(jnp.asarray(solution.x)), now, solution, intervals)
+
+
+def check_covariates(record: Record, model: GyroModel) -> None:
+    """Refuse missing values in a column that an effect needs."""
+    for effect in model.effects:
+        for name in effect.columns_needed:
+            bad = np.flatnonzero(~np.isfinite(np.asarray(record.signals[name])[: record.rows]) & record.present)
+            if len(bad):
+                some = ", ".join(str(i + 1) for i in bad[:5]) + ("…" if len(bad) > 5 else "")
+                raise ModelError(f"effect {effect.label} needs column {name}, which is NaN in data rows {some}")
+
+
+def given_ratios(record: Record, model: GyroModel) -> NoiseRatios | None:
+    """Noise ratios of a model that states its noise; None where it is to be estimated."""
+    if not model.noise:
+        return None
+    white = float(model.noise.get("noise_white", 0.0))
+    if white <= 0:
+        raise ModelError("a model that states its noise needs a noise_white above zero")
+    variance = white**2 / record.interval
+    flicker = model.noise.get("noise_flicker", 0.0) ** 2 / variance
+    walk = model.noise.get("noise_random_walk", 0.0) ** 2 * record.interval / variance
+    return NoiseRatios(jnp.asarray(flicker), jnp.asarray(walk))
+
+
+@jax.jit
+def make_filter(ratios: NoiseRatios, interval, span, sampling) -> Filter:
+    """The whitening filter of one noise cell."""
+    return build_filter(markov_sum(ratios, interval, span), sampling)
+
+
+def filter_of(record: Record, ratios: NoiseRatios) -> Filter:
+    """The whitening filter of one noise cell on a record."""
+    ratios = NoiseRatios(*(jnp.asarray(r) for r in ratios))
+    return make_filter(ratios, record.interval, record_span(record), record.sampling)
+
+
+whiten_columns = jax.jit(whiten)
+
+
+@jax.jit
+def _gram(filter: Filter, columns):
+    w = whiten(filter, columns)
+    return w.T @ w
+
+
+def solve(model: GyroModel, x: np.ndarray, record: Record, ratios: NoiseRatios, solver: Solver) -> Solution:
+    """Minimise the whitened sum of squares; optimistix takes over where the own solver does not converge."""
+    filter = filter_of(record, ratios)
+    output = record.signals["output"]
+
+    def normal(v: np.ndarray) -> Normal:
+        predicted, jacobian = model.with_vector(jnp.asarray(v)).linearise(record.signals)
+        residual = jnp.where(filter.present, predicted - output, 0.0)
+        gram = np.asarray(_gram(filter, pad_columns(jnp.column_stack([jacobian, residual]))))
+        p = len(v)
+        return gram[:p, :p], gram[:p, p], float(gram[p, p])
+
+    if not len(x):
+        return Solution(x, normal(x)[2], 0, True)
+    if solver == "levenberg_marquardt":
+        solution = levenberg_marquardt(normal, np.asarray(x))
+        if solution.converged and np.isfinite(solution.x).all():
+            return solution
+    return optimistix_solution(model, jnp.asarray(x), record.signals, filter)
+
+
+def pad_columns(columns, step: int = 8):
+    """Zero columns up to a multiple of `step`, so that compiled shapes recur."""
+    return jnp.pad(columns, ((0, 0), (0, -columns.shape[1] % step)))
+
+
+def best_ratios(record: Record, model: GyroModel, *, coarse: bool, start: NoiseRatios) -> NoiseRatios:
+    """Flicker and walk of greatest restricted likelihood: the whole grid, then ever finer squares around the best cell."""
+    predicted, jacobian = model.linearise(record.signals)
+    residual = jnp.where(record.sampling.present, record.signals["output"] - predicted, 0.0)
+    span = record_span(record)
+
+    def likelihood(cells: NoiseRatios) -> np.ndarray:
+        args = (record.interval, span, record.sampling, jacobian, residual)
+        return restricted_likelihood(cells, *args).log_likelihood
+
+    best = start
+    if coarse:
+        grid = noise_grid(int(record.present.sum()), record.interval, span)
+        best = _at(grid.ratios, int(np.argmax(likelihood(grid.ratios))))
+    for width in (2.2, 1.3, 0.7, 0.4, 0.2) if coarse else (0.7, 0.35, 0.17):
+        factors = np.exp(width * np.linspace(-1, 1, 5))
+        flicker, walk = (np.unique(np.asarray(r) * factors) for r in best)
+        f, w = (jnp.asarray(v.ravel()) for v in np.meshgrid(flicker, walk, indexing="ij"))
+        cells = NoiseRatios(f, w)
+        best = _at(cells, int(np.argmax(likelihood(cells))))
+    return best
+
+
+def _at(ratios: NoiseRatios, i: int) -> NoiseRatios:
+    return NoiseRatios(ratios.flicker[i], ratios.walk[i])
+
+
+def _close(a: NoiseRatios, b: NoiseRatios) -> bool:
+    return all(abs(np.log((float(x) + 1e-300) / (float(y) + 1e-300))) < 0.05 for x, y in zip(a, b, strict=True))
+
+
+def _finish(record: Record, model: GyroModel, ratios: NoiseRatios, solution: Solution, intervals: bool) -> Estimate:
+    predicted, jacobian = model.linearise(record.signals)
+    output, present = record.signals["output"], record.sampling.present
+    residual = jnp.where(present, output - predicted, 0.0)
+    filter = filter_of(record, ratios)
+    p = jacobian.shape[1]
+    w = np.asarray(whiten_columns(filter, pad_columns(jnp.column_stack([jacobian, residual]))))[np.asarray(present), : p + 1]
+    covariance = unit_covariance(w[:, :p], model)
+    nu = len(w) - p
+    variance = float(w[:, p] @ w[:, p]) / nu
+    args = (record.interval, record_span(record), record.sampling, jacobian, residual)
+    one = NoiseRatios(jnp.atleast_1d(ratios.flicker), jnp.atleast_1d(ratios.walk))
+    likelihood = restricted_likelihood(one, *args)
+    gain = float(model.gain())
+    noise = dict(model.noise) or noise_coefficients(ratios, variance, record, gain)
+    spans = _noise_intervals(args, ratios, record, gain) if intervals and not model.noise else {}
+    rows = record.rows
+    whitened = np.full(rows, np.nan)
+    whitened[record.present] = w[:, p] / np.sqrt(variance)
+    return Estimate(
+        model=GyroModel(model.effects, noise, model.fixed, model.gyro),
+        covariance=covariance * variance,
+        degrees_of_freedom=nu,
+        residual=np.where(record.present, np.asarray(residual)[:rows], np.nan),
+        whitened=whitened,
+        ratios=ratios,
+        white_variance=variance,
+        log_likelihood=float(likelihood.log_likelihood[0]),
+        converged=bool(solution.converged),
+        iterations=int(solution.iterations),
+        record=record,
+        noise_given=bool(model.noise),
+        noise_interval=spans,
+    )
+
+
+def unit_covariance(whitened_jacobian: np.ndarray, model: GyroModel) -> np.ndarray:
+    """(JᵀJ)⁻¹ from an R-only QR; refuses directions that the data do not determine, naming their effects."""
+    p = whitened_jacobian.shape[1]
+    if p == 0:
+        return np.zeros((0, 0))
+    slots = model.slots()
+    norm = np.linalg.norm(whitened_jacobian, axis=0)
+    if (norm == 0).any():
+        silent = sorted({model.labels[slots[i].effect] for i in np.flatnonzero(norm == 0)})
+        raise EstimateError(f"{', '.join(silent)} cannot be estimated: this campaign does not excite it; remove it or fix it")
+    r = np.linalg.qr(whitened_jacobian / norm, mode="r")
+    _, singular, directions = np.linalg.svd(r)
+    weak = directions[singular < SINGULAR * singular[0]]
+    if len(weak):
+        involved = sorted({model.labels[slots[i].effect] for d in weak for i in np.flatnonzero(np.abs(d) > 0.1)})
+        raise EstimateError(
+            f"{' and '.join(involved)} cannot be told apart on this campaign: fix all but one, or measure where they differ"
+        )
+    inverse = np.linalg.inv(r)
+    return (inverse @ inverse.T) / np.outer(norm, norm)
+
+
+def _noise_intervals(args, ratios: NoiseRatios, record: Record, gain: float) -> dict[str, tuple[float, float]]:
+    """95 % intervals from slices of the restricted likelihood through its maximum, one per ratio."""
+    grid = noise_grid(int(record.present.sum()), record.interval, record_span(record)).ratios
+    spans: dict[str, list[float]] = {}
+    whites: list[tuple[float, float]] = []
+    for axis, name in enumerate(("noise_flicker", "noise_random_walk")):
+        levels = np.unique(np.asarray(grid[axis]))
+        centre = float(ratios[axis])
+        fine = centre * np.exp(np.linspace(-2.5, 2.5, 21)) if centre > 0 else []
+        values = np.unique(np.concatenate([levels[levels > 0], fine]))
+        cells = [jnp.full(len(values) + 1, float(r)) for r in ratios]
+        cells[axis] = jnp.asarray(np.concatenate([[0.0], values]))
+        result = restricted_likelihood(NoiseRatios(*cells), *args)
+        weight = np.exp(result.log_likelihood - result.log_likelihood.max())
+        # Trapezoid in the logarithm of the ratio; "absent" weighs as much as one e-fold.
+        mass = weight * np.concatenate([[1.0], np.gradient(np.log(values))])
+        mass /= mass.sum()
+        cumulative = np.cumsum(mass)
+        white = result.residual_sum / result.degrees_of_freedom
+        coefficient = [
+            noise_coefficients(NoiseRatios(*(c[i] for c in cells)), white[i], record, gain) for i in range(len(mass))
+        ]
+        low, high = np.searchsorted(cumulative, [0.025, 0.975])
+        spans[name] = [coefficient[low][name], coefficient[min(high, len(mass) - 1)][name]]
+        whites += [(coefficient[i]["noise_white"], mass[i]) for i in range(len(mass))]
+    whites.sort()
+    cumulative = np.cumsum([m for _, m in whites]) / sum(m for _, m in whites)
+    scatter = 1.96 / np.sqrt(2 * (record.present.sum() - 1))
+    low, high = (whites[min(int(i), len(whites) - 1)][0] for i in np.searchsorted(cumulative, [0.025, 0.975]))
+    spans["noise_white"] = [low * (1 - scatter), high * (1 + scatter)]
+    return {k: (float(v[0]), float(v[1])) for k, v in spans.items()}

@@ -1,0 +1,247 @@
+"""`GyroModel`: a sum of effects and a noise model, composed in the published order."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from gyromodel.campaign import Campaign
+from gyromodel.effects import CATALOGUE, Effect, Signals
+from gyromodel.effects._base import evaluate
+from gyromodel.effects.drivers import BiasColumn
+from gyromodel.noise import NoiseRatios, markov_sum
+from gyromodel.numerics.state_space import unwhiten
+from gyromodel.signals import Record, read_signals
+from gyromodel.units import from_internal
+
+
+class ModelError(ValueError):
+    """A model that cannot be built or does not fit the campaign; the message says what to change."""
+
+
+class Slot(NamedTuple):
+    """Where one parameter sits: effect number, field, index within it, and whether the output is linear in it."""
+
+    effect: int
+    field: str
+    index: int
+    linear: bool
+
+
+class GyroModel(eqx.Module):
+    """output = Π gains · (rate + Σ rate terms) · (1 + Σ scale terms) + noise.
+
+    `noise` holds coefficients in internal units by noise id, or is empty for "estimate it"; `fixed` names the parameters
+    that are known, as (effect label, field).
+    """
+
+    effects: tuple[Effect, ...]
+    noise: Mapping[str, Float[Array, ""]] = eqx.field(
+        converter=lambda given: {k: jnp.asarray(v, float) for k, v in given.items()}, default_factory=dict
+    )
+    fixed: frozenset[tuple[str, str]] = eqx.field(static=True, default=frozenset())
+    gyro: str = eqx.field(static=True, default="")
+
+    def __check_init__(self) -> None:
+        labels = [e.label for e in self.effects]
+        twice = {x for x in labels if labels.count(x) > 1} - {"bias_periodic", "bias_step"}
+        if twice:
+            raise ModelError(f"the model lists {min(twice)} twice; keep one")
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Public ids of the effects, in order."""
+        return tuple(e.label for e in self.effects)
+
+    def with_effect(self, effect: Effect) -> GyroModel:
+        """The model extended by one effect, which replaces any that it contains as a special case."""
+        kept = tuple(e for e in self.effects if e.label not in effect.supersedes)
+        return eqx.tree_at(lambda m: m.effects, self, (*kept, effect))
+
+    def without(self, label: str) -> GyroModel:
+        """The model less one effect (the last of that label)."""
+        where = max((i for i, name in enumerate(self.labels) if name == label), default=None)
+        if where is None:
+            raise ModelError(f"the model has no {label}")
+        return eqx.tree_at(lambda m: m.effects, self, self.effects[:where] + self.effects[where + 1 :])
+
+    def prepared(self, signals: Signals) -> GyroModel:
+        """Reference points and start values that depend on the campaign filled in."""
+        for effect in self.effects:
+            for name in effect.columns_needed:
+                if name not in signals:
+                    raise ModelError(f"effect {effect.label} needs a column {name}, which the campaign lacks")
+        return eqx.tree_at(lambda m: m.effects, self, tuple(e.prepared(signals) for e in self.effects))
+
+    def slots(self) -> tuple[Slot, ...]:
+        """The free parameters, in the order of the parameter vector."""
+        found = []
+        for i, effect in enumerate(self.effects):
+            for name, declared in effect.declared().items():
+                if (effect.label, name) in self.fixed or name in effect.held:
+                    continue
+                found += [Slot(i, name, j, declared.linear) for j in range(np.size(getattr(effect, name)))]
+        return tuple(found)
+
+    def _fields(self) -> list[tuple[int, str]]:
+        return list(dict.fromkeys((s.effect, s.field) for s in self.slots()))
+
+    def vector(self) -> Float[Array, " parameter"]:
+        """Values of the free parameters, in internal units."""
+        values = [jnp.ravel(getattr(self.effects[i], name)) for i, name in self._fields()]
+        return jnp.concatenate(values) if values else jnp.zeros(0)
+
+    def with_vector(self, vector: Float[Array, " parameter"]) -> GyroModel:
+        """The model at other values of its free parameters."""
+        effects, start = list(self.effects), 0
+        for i, name in self._fields():
+            old = getattr(effects[i], name)
+            new = jnp.reshape(vector[start : start + jnp.size(old)], jnp.shape(old))
+            effects[i] = eqx.tree_at(lambda e, name=name: getattr(e, name), effects[i], new)
+            start += jnp.size(old)
+        return eqx.tree_at(lambda m: m.effects, self, tuple(effects))
+
+    def _sites(self, signals: Signals) -> tuple[Array, Array, Array]:
+        rate = signals.get("rate", jnp.zeros_like(signals["time"]))
+        gain, scale = jnp.ones(()), jnp.ones_like(rate)
+        for effect in self.effects:
+            if effect.site == "gain":
+                gain = gain * effect.value  # type: ignore[attr-defined]
+            elif effect.site == "rate":
+                rate = rate + effect.contribution(signals)
+            else:
+                scale = scale + effect.contribution(signals)
+        return gain, rate, scale
+
+    def gain(self) -> Float[Array, ""]:
+        """Output per unit of input rate."""
+        values = [e.value for e in self.effects if e.site == "gain"]  # type: ignore[attr-defined]
+        return jnp.prod(jnp.stack(values)) if values else jnp.ones(())
+
+    def predict(self, signals: Signals) -> Float[Array, " sample"]:
+        """The noise-free output, in the campaign's internal output unit."""
+        gain, rate, scale = self._sites(signals)
+        return gain * rate * scale
+
+    def columns_of(self, effect: Effect, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """Derivative of the output by the effect's linear coefficients, were it added to (or as it stands in) this model."""
+        gain, rate, scale = self._sites(signals)
+        if effect.site == "gain":
+            return (rate * scale * gain / effect.value)[:, None]  # type: ignore[attr-defined]
+        weight = gain * scale if effect.site == "rate" else gain * rate
+        return weight[:, None] * effect.columns(signals)
+
+    def linearise(self, signals: Signals) -> tuple[Float[Array, " sample"], Float[Array, "sample parameter"]]:
+        """The prediction and its Jacobian by the free parameters: structured columns, one jvp per nonlinear parameter."""
+        rate = signals.get("rate", jnp.zeros_like(signals["time"]))
+        scale = jnp.ones_like(rate)
+        pieces = [None if e.site == "gain" else evaluate(e, signals) for e in self.effects]
+        for effect, piece in zip(self.effects, pieces, strict=True):
+            if piece is not None and effect.site == "rate":
+                rate = rate + piece[2]
+            elif piece is not None:
+                scale = scale + piece[2]
+        gain = self.gain()
+        prediction = gain * rate * scale
+        by_rate, by_scale = gain * scale, gain * rate
+        columns = []
+        for i, name in self._fields():
+            effect, piece = self.effects[i], pieces[i]
+            if piece is None:
+                columns.append((prediction / effect.value)[:, None])  # type: ignore[attr-defined]
+                continue
+            linear = effect.declared()[name].linear
+            first = sum(
+                jnp.size(getattr(effect, k))
+                for k, d in itertools.takewhile(lambda kd: kd[0] != name, effect.declared().items())
+                if d.linear == linear
+            )
+            part = piece[0 if linear else 1][:, first : first + jnp.size(getattr(effect, name))]
+            columns.append((by_rate if effect.site == "rate" else by_scale)[:, None] * part)
+        return prediction, jnp.concatenate(columns, axis=1) if columns else jnp.zeros((prediction.shape[0], 0))
+
+
+def effect_class(label: str) -> type[Effect]:
+    """The catalogue class of a public id; bias_<column> is a linear driver."""
+    if label in CATALOGUE and label != "bias_column":
+        return CATALOGUE[label]
+    if label.startswith("bias_") and label != "bias_column":
+        return BiasColumn
+    known = ", ".join(sorted(set(CATALOGUE) - {"bias_column"}))
+    raise ModelError(f"unknown effect {label}; the catalogue has {known}, and bias_<column> for any other column")
+
+
+def make_effect(label: str) -> Effect:
+    """A catalogue effect at its default values."""
+    kind = effect_class(label)
+    return kind(column=label.removeprefix("bias_")) if kind is BiasColumn else kind()  # type: ignore[call-arg]
+
+
+def model_from_effects(labels: Iterable[str], gyro: str = "") -> GyroModel:
+    """A model of the named effects with every parameter free and the noise to be estimated."""
+    return GyroModel(tuple(make_effect(label) for label in labels), gyro=gyro)
+
+
+def parameter_unit(effect: Effect, field: str, output_unit: str, units: Mapping[str, str]) -> str:
+    """The unit a parameter is reported in; a gain's follows the output, a linear driver's its column (file units)."""
+    if effect.site == "gain":
+        return "1" if output_unit == "rad/s" else f"{output_unit}/(deg/s)"
+    unit = effect.declared()[field].unit
+    if isinstance(effect, BiasColumn):
+        column = units.get(effect.column, "")
+        return f"{unit}/({column})" if column not in ("", "1") else unit
+    return unit
+
+
+def simulate(model: GyroModel, campaign: Campaign, seed: int = 0) -> Campaign:
+    """The campaign with its output replaced by the model's, noise drawn from the model's noise coefficients.
+
+    Raises:
+        ModelError: the model misses a value, a column or its noise.
+    """
+    if "output" not in campaign.columns:
+        campaign = campaign.with_column("output", np.arange(len(campaign), dtype=float), "deg/s")
+    record = read_signals(campaign)
+    unset = [e.label for e in model.effects if not np.isfinite(np.asarray(e.linear())).all()]
+    if unset:
+        raise ModelError(f"effect {unset[0]} has no value; fit the model or write one to simulate")
+    model = model.prepared(record.signals)
+    output = np.asarray(model.predict(record.signals))[: record.rows]
+    output = output + draw_noise(model, record, np.random.default_rng(seed))
+    kind = campaign.metadata.get("kind", "rate")
+    if kind != "rate":
+        step = np.diff(campaign.si("time"))
+        output = output * np.concatenate([[np.median(step)], step])
+        output = np.cumsum(output) if kind == "angle" else output
+    return campaign.with_column("output", from_internal(output, campaign.units["output"]), campaign.units["output"])
+
+
+def draw_noise(model: GyroModel, record: Record, rng: np.random.Generator) -> np.ndarray:
+    """One draw of the model's noise in output units, through the same state-space form that whitens it."""
+    white = float(model.noise.get("noise_white", 0.0))
+    if not model.noise:
+        return np.zeros(record.rows)
+    if white <= 0:
+        raise ModelError("noise needs a noise_white above zero")
+    variance = white**2 / record.interval
+    ratios = NoiseRatios(
+        jnp.asarray(model.noise.get("noise_flicker", 0.0) ** 2 / variance),
+        jnp.asarray(model.noise.get("noise_random_walk", 0.0) ** 2 * record.interval / variance),
+    )
+    draws = jnp.asarray(rng.standard_normal(len(record.sampling.present)))
+    sampling = record.sampling._replace(present=jnp.ones_like(record.sampling.present))
+    noise = unwhiten(markov_sum(ratios, record.interval, record_span(record)), sampling, draws)
+    return np.asarray(noise)[: record.rows] * np.sqrt(variance) * abs(float(model.gain()))
+
+
+def record_span(record: Record) -> float:
+    """Time from first to last sample (s), at least two intervals."""
+    time = np.asarray(record.signals["time"])[: record.rows]
+    return float(max(np.max(time) - np.min(time), 2 * record.interval))
+

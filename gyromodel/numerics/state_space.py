@@ -1,0 +1,127 @@
+"""Linear-Gaussian filter for a signal in white noise plus a sum of scalar Markov processes: whitening and likelihood in O(n).
+
+The observation at time t is the sum of all states plus white noise; each state decays at its own rate (rate zero: a random
+walk). Samples may be unequally spaced or missing, and independent records may follow one another. The filter is the
+Cholesky factor of the noise covariance, V = L Lᵀ, applied without ever forming V.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+
+class Sampling(NamedTuple):
+    """When the samples were taken and how far each can be trusted.
+
+    `interval[t]` is the time since the previous sample (s); `restart[t]` opens an independent record; `present[t]` is False
+    for a missing sample; `white[t]` is the white variance relative to the unit of the noise model.
+    """
+
+    interval: Float[Array, " sample"]
+    restart: Bool[Array, " sample"]
+    present: Bool[Array, " sample"]
+    white: Float[Array, " sample"]
+
+
+class MarkovSum(NamedTuple):
+    """Sum of Markov processes: decay rates (1/s) and, where decaying, the stationary variance, else variance per second."""
+
+    decay: Float[Array, " state"]
+    variance: Float[Array, " state"]
+
+
+class Filter(NamedTuple):
+    """Everything the whitening recursions need: per-sample transition and gain, and the innovation's standard deviation."""
+
+    transition: Float[Array, "sample state"]
+    gain: Float[Array, "sample state"]
+    scale: Float[Array, " sample"]
+    present: Bool[Array, " sample"]
+
+    @property
+    def log_determinant(self) -> Float[Array, ""]:
+        """ln |V| of the samples present."""
+        return 2.0 * jnp.sum(jnp.where(self.present, jnp.log(self.scale), 0.0))
+
+
+def build_filter(noise: MarkovSum, sampling: Sampling) -> Filter:
+    """Run the covariance recursion once; the result whitens any number of columns."""
+    decaying = noise.decay > 0
+    prior = jnp.diag(jnp.where(decaying, noise.variance, 0.0))
+
+    def step(covariance, inputs):
+        interval, restart, present, white = inputs
+        # Transition into this sample from the previous one.
+        phi = jnp.exp(-noise.decay * interval)
+        added = noise.variance * jnp.where(decaying, -jnp.expm1(-2.0 * noise.decay * interval), interval)
+        covariance = jnp.where(restart, prior, jnp.outer(phi, phi) * covariance + jnp.diag(added))
+        cross = covariance.sum(1)
+        variance = cross.sum() + white
+        gain = jnp.where(present, cross / variance, 0.0)
+        covariance = covariance - jnp.outer(gain, cross)
+        return covariance, (jnp.where(restart, 0.0, phi), gain, jnp.sqrt(variance))
+
+    _, (transition, gain, scale) = jax.lax.scan(step, prior, sampling._replace())
+    return Filter(transition, gain, scale, sampling.present)
+
+
+def whiten(filter: Filter, columns: Float[Array, "sample column"]) -> Float[Array, "sample column"]:
+    """L⁻¹ applied to columns; rows of missing samples come out zero."""
+
+    def step(state, inputs):
+        transition, gain, scale, present, row = inputs
+        state = transition[:, None] * state
+        innovation = jnp.where(present, row - state.sum(0), 0.0)
+        return state + gain[:, None] * innovation, innovation / scale
+
+    start = jnp.zeros((filter.gain.shape[1], columns.shape[1]))
+    rows = jnp.where(filter.present[:, None], columns, 0.0)
+    return jax.lax.scan(step, start, (*filter, rows))[1]
+
+
+def unwhiten(noise: MarkovSum, sampling: Sampling, draws: Float[Array, " sample"]) -> Float[Array, " sample"]:
+    """L applied to independent unit normal draws: one realisation of the noise."""
+    filter = build_filter(noise, sampling)
+
+    def step(state, inputs):
+        transition, gain, scale, _, draw = inputs
+        state = transition * state
+        value = state.sum() + scale * draw
+        return state + gain * scale * draw, value
+
+    return jax.lax.scan(step, jnp.zeros(filter.gain.shape[1]), (*filter, draws))[1]
+
+
+def whiten_transposed(filter: Filter, columns: Float[Array, "sample column"]) -> Float[Array, "sample column"]:
+    """L⁻ᵀ applied to columns, so that V⁻¹x = whiten_transposed(whiten(x))."""
+
+    def step(adjoint, inputs):
+        transition, gain, scale, present, row = inputs
+        out = jnp.where(present, row / scale + gain @ adjoint, 0.0)
+        return transition[:, None] * (adjoint - out), out
+
+    start = jnp.zeros((filter.gain.shape[1], columns.shape[1]))
+    return jax.lax.scan(step, start, (*filter, columns), reverse=True)[1]
+
+
+def step_and_pulse_energy(filter: Filter) -> tuple[Float[Array, " sample"], Float[Array, " sample"]]:
+    """Squared norms of a whitened unit step from each sample on, and of a whitened unit pulse at each sample, in one pass."""
+    states = filter.gain.shape[1]
+    zero, one = jnp.zeros(1), jnp.ones(1)
+
+    def step(weight, inputs):
+        transition, gain, scale, present = inputs
+        # State (1, m): m <- φm at arrival, innovation 1 - Σm, m <- m + gain·innovation. `weight` measures what follows.
+        arrive = jnp.concatenate([one, transition])
+        observe = jnp.where(present, jnp.concatenate([one, -jnp.ones(states)]), 0.0)
+        update = jnp.eye(states + 1) + jnp.outer(jnp.concatenate([zero, gain]), observe)
+        here = update.T @ weight @ update + jnp.outer(observe, observe) / scale**2
+        pulse = jnp.where(present, 1.0 / scale**2 + gain @ weight[1:, 1:] @ gain, 0.0)
+        return arrive[:, None] * here * arrive, (here[0, 0], pulse)
+
+    start = jnp.zeros((states + 1, states + 1))
+    return jax.lax.scan(step, start, tuple(filter), reverse=True)[1]

@@ -1,0 +1,377 @@
+"""The page: tables and figures of a diagnosis, filled into the packaged template."""
+
+from __future__ import annotations
+
+import html
+import math
+import os
+import re
+from collections.abc import Iterable, Mapping
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gyromodel.report._numbers import count, number, pair, percent, unit_text, with_uncertainty
+from gyromodel.report._sentence import confused, kinds, sentence
+from gyromodel.report._words import driver_name, listed, phrase, spoken, title
+
+if TYPE_CHECKING:
+    from gyromodel.diagnose._result import Cause, Diagnosis, Round
+
+_BADGES = {
+    "adequate": "Nothing missing",
+    "named": "Cause named",
+    "ambiguous": "Cause ambiguous",
+    "unknown": "Cause unknown",
+}
+_RANKED = 12
+
+
+def write_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> list[Path]:
+    """Write report.html, which needs no other file, and each of its figures as SVG under figures/.
+
+    Args:
+        diagnosis: what `gyromodel.diagnose` returned.
+        folder: where; made if missing.
+
+    Returns:
+        The files written, report.html first.
+
+    Raises:
+        OSError: where the folder cannot be written.
+    """
+    from gyromodel.report._figures import figures
+
+    folder = Path(folder)
+    drawn = figures(diagnosis)
+    page = rendered(diagnosis, drawn)
+    (folder / "figures").mkdir(parents=True, exist_ok=True)
+    written = []
+    for figure in drawn.all():
+        written.append(_replace(folder / "figures" / f"{figure.name}.svg", figure.svg))
+    return [_replace(folder / "report.html", page), *written]
+
+
+def rendered(diagnosis: Diagnosis, drawn: Any) -> str:
+    """The page as text."""
+    import jinja2
+
+    from gyromodel.report._drawing import inline
+
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters |= {"pretty": _markup, "breakable": _breakable, "inline": inline, "percent": percent}
+    text = resources.files("gyromodel.report").joinpath("template.html").read_text(encoding="utf-8")
+    return environment.from_string(text).render(context(diagnosis), figures=drawn)
+
+
+def context(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Everything the template prints, as text and shares of a full bar."""
+    kind = kinds(diagnosis)
+    return {
+        "verdict": diagnosis.verdict,
+        "badge": _BADGES[diagnosis.verdict],
+        "sentence": sentence(diagnosis),
+        "campaign": diagnosis.campaign.name,
+        "facts": _facts(diagnosis),
+        "tiles": _tiles(diagnosis),
+        "causes": [_cause(cause) for cause in diagnosis.causes],
+        "confused": [phrase(name, kind.get(name, "effect")) for name in confused(diagnosis)],
+        "rankings": _rankings(diagnosis),
+        "ladder": _ladder(diagnosis),
+        "gain": _gain(diagnosis),
+        "noise": _noise(diagnosis.noise),
+        "credible": [
+            {
+                "title": title(name, kind.get(name, "effect")),
+                "id": name if kind.get(name, "effect") in ("effect", "noise") else "",
+                "share": share,
+            }
+            for name, share in sorted(diagnosis.credible_set.items(), key=lambda item: -item[1])
+        ],
+        "unexplained": [
+            {"title": driver_name(name).capitalize(), "share": share}
+            for name, share in sorted(diagnosis.unexplained.items(), key=lambda item: -item[1])
+        ],
+        "searched": _searched(diagnosis),
+        "not_testable": [
+            {"title": title(name), "id": name, "reason": reason} for name, reason in diagnosis.not_testable.items()
+        ],
+        "findings": [text[:1].upper() + text[1:] for text in diagnosis.findings],
+        "next_test": diagnosis.next_test,
+        "parameters": _parameters(diagnosis),
+        "threshold": _threshold(diagnosis),
+        "rate_unit": unit_text(diagnosis.rate_unit),
+        "version": _version(),
+    }
+
+
+def _facts(diagnosis: Diagnosis) -> list[str]:
+    """What was measured, in a line."""
+    campaign = diagnosis.campaign
+    rows = len(next(iter(campaign.columns.values())))
+    said = {key: campaign.metadata[key] for key in ("gyro", "serial", "test") if key in campaign.metadata}
+    return [*(f"{key} {value}" for key, value in said.items()), f"{count(rows)} samples"]
+
+
+def _tiles(diagnosis: Diagnosis) -> list[dict[str, str]]:
+    """The few numbers that carry the verdict."""
+    gain = diagnosis.gain
+    before, after = pair(gain.before, gain.after)
+    unit = unit_text(gain.unit)
+    tiles = []
+    if math.isfinite(gain.before):
+        changed = math.isfinite(gain.after) and before != after
+        shown = _arrow(before, after) if changed else number(gain.before)
+        note = "root mean square, held out"
+        tiles.append({"label": "Error on data not used", "value": f"{shown} {unit}", "note": note})
+    if math.isfinite(gain.ratio) and gain.after != gain.before:
+        low, high = gain.ci95
+        note = f"95 % interval {number(low, 3)} to {number(high, 3)}"
+        tiles.append({"label": "Error before ÷ after", "value": f"{number(gain.ratio, 3)}", "note": note})
+    best = max((r.statistic for r in diagnosis.rounds if r.added), default=None)
+    top = [c.statistic for r in diagnosis.rounds[:1] for c in r.ranking if c.kind != "none"]
+    if best is None and top:
+        best = max(top)
+    if best is not None:
+        note = f"needed: {number(diagnosis.threshold, 2)}"
+        tiles.append({"label": "Strongest evidence (ln)", "value": _evidence(best), "note": note})
+    return tiles
+
+
+def _arrow(before: str, after: str) -> str:
+    """Two numbers with an arrow between, their common power of ten taken out."""
+    (first, _, power), (second, _, other) = before.partition("e"), after.partition("e")
+    return f"({first} → {second})e{power}" if power and power == other else f"{before} → {after}"
+
+
+def _cause(cause: Cause) -> dict[str, Any]:
+    return {
+        "title": title(cause.effect),
+        "id": cause.effect,
+        "statistic": _evidence(cause.statistic),
+        "odds": _odds(cause.statistic),
+        "p": _small(cause.p_adjusted),
+        "posterior": percent(cause.posterior),
+        "parameters": [
+            {"name": spoken(p.name), "value": with_uncertainty(p.value, p.std, p.unit)} for p in cause.parameters
+        ],
+        "confusers": [
+            {"title": title(c.effect), "id": c.effect, "separation": c.separation, "word": _separation(c.separation)}
+            for c in sorted(cause.confusers, key=lambda c: c.separation)
+        ],
+        "points": _rows(cause.points),
+    }
+
+
+def _rankings(diagnosis: Diagnosis) -> list[dict[str, Any]]:
+    """Per round, the best candidates with bars of evidence."""
+    kind = kinds(diagnosis)
+    added = {cause.effect for cause in diagnosis.causes}
+    tables = []
+    for index, step in enumerate(diagnosis.rounds, 1):
+        ranked = sorted(step.ranking, key=lambda c: -c.statistic if math.isfinite(c.statistic) else math.inf)
+        ranked = ranked[:_RANKED]
+        top = max([diagnosis.threshold, *(c.statistic for c in ranked if math.isfinite(c.statistic))], default=1.0)
+        rows = [
+            {
+                "title": title(c.effect, c.kind),
+                "id": c.effect,
+                "kind": c.kind,
+                "statistic": _evidence(c.statistic),
+                "bar": _bar(c.statistic, top),
+                "above": c.statistic > diagnosis.threshold,
+                "posterior": percent(c.posterior),
+                "chosen": c.effect == step.added or (step.added is None and c.effect in added),
+            }
+            for c in ranked
+        ]
+        mark = _bar(diagnosis.threshold, top)
+        more = len(step.ranking) - len(rows)
+        added_title = step.added and title(step.added, kind.get(step.added, "effect"))
+        tables.append({"number": index, "added": added_title, "rows": rows, "mark": mark, "more": more})
+    return tables
+
+
+def _ladder(diagnosis: Diagnosis) -> list[dict[str, str]]:
+    """The rounds as steps, from the simulation as given."""
+    steps = [r for r in diagnosis.rounds if r.added]
+    kind = kinds(diagnosis)
+    shown = [_step(index, step, kind.get(step.added or "", "effect")) for index, step in enumerate(steps, 1)]
+    if math.isfinite(diagnosis.gain.before):
+        start = {"number": "0", "title": "Your simulation", "id": "", "statistic": "", "score": ""}
+        shown.insert(0, start | {"held_out": number(diagnosis.gain.before, 3)})
+    return shown
+
+
+def _step(index: int, step: Round, kind: str) -> dict[str, str]:
+    assert step.added is not None
+    return {
+        "number": str(index),
+        "title": title(step.added, kind),
+        "id": "" if kind == "driver" else step.added,
+        "statistic": _evidence(step.statistic),
+        "held_out": number(step.held_out, 3),
+        "score": _evidence(step.log_score),
+    }
+
+
+def _gain(diagnosis: Diagnosis) -> dict[str, Any]:
+    gain = diagnosis.gain
+    before, after = pair(gain.before, gain.after)
+    low, high = gain.ci95
+    return {
+        "before": before,
+        "after": after,
+        "unit": unit_text(gain.unit),
+        "ratio": number(gain.ratio, 3),
+        "low": number(low, 3),
+        "high": number(high, 3),
+        "scheme": spoken(gain.scheme),
+        "folds": gain.folds,
+        "score": _evidence(gain.log_score),
+        "score_low": _evidence(gain.log_score_ci95[0]),
+        "score_high": _evidence(gain.log_score_ci95[1]),
+        "measured": math.isfinite(gain.before) and math.isfinite(gain.after),
+        "alone": number(gain.before),
+        "same": gain.after == gain.before,
+        "bars": [100.0 * error / max(gain.before, gain.after, 1e-300) for error in (gain.before, gain.after)],
+    }
+
+
+def _noise(noise: Mapping[str, Mapping[str, float | str]]) -> list[dict[str, str]]:
+    rows = []
+    for name, entry in noise.items():
+        value, low, high = (float(entry.get(key, math.nan)) for key in ("value", "lo", "hi"))
+        interval = f"{number(low, 3)} to {number(high, 3)}" if math.isfinite(low) or math.isfinite(high) else "–"
+        unit = unit_text(str(entry.get("unit", "")))
+        rows.append({"title": title(name), "id": name, "value": number(value, 3), "interval": interval, "unit": unit})
+    return rows
+
+
+def _searched(diagnosis: Diagnosis) -> list[dict[str, str]]:
+    """Each searched effect with the smallest size that would have been seen."""
+    named = {cause.effect for cause in diagnosis.causes}
+    rows = []
+    for name in dict.fromkeys([*diagnosis.searched, *diagnosis.minimum_detectable]):
+        size, unit = diagnosis.minimum_detectable.get(name, (math.nan, ""))
+        smallest = f"{number(size)} {unit_text(unit)}".strip() if math.isfinite(size) else "–"
+        found = {"named": "named", "ambiguous": "possible"}.get(diagnosis.verdict, "named") if name in named else ""
+        rows.append({"title": title(name), "id": name, "smallest": smallest, "found": found})
+    return rows
+
+
+def _parameters(diagnosis: Diagnosis) -> list[dict[str, str]]:
+    """Every parameter of the extended model beside its value in the simulation as given."""
+    given = {}
+    if diagnosis.baseline is not None:
+        given = {(row[0], row[1]): row for row in diagnosis.baseline.table()}
+    rows = []
+    for effect, name, value, std, unit in diagnosis.extended.table() if diagnosis.extended is not None else ():
+        old = given.get((effect, name))
+        rows.append(
+            {
+                "effect": effect,
+                "name": spoken(name),
+                "before": with_uncertainty(old[2], old[3], old[4]) if old else "not in it",
+                "after": with_uncertainty(value, std, unit),
+                "fixed": std == 0.0,
+                "new": old is None,
+            }
+        )
+    return rows
+
+
+def _threshold(diagnosis: Diagnosis) -> str:
+    bound = number(diagnosis.threshold, 2)
+    if diagnosis.threshold_kind == "calibrated":
+        return (
+            f"An effect is accepted when its evidence exceeds {bound}. This bound was calibrated: it is what the best "
+            "of all candidates reaches in one of 100 simulations of this campaign with its noise and nothing missing."
+        )
+    return (
+        f"An effect is accepted when its evidence exceeds {bound}, odds of {_odds(diagnosis.threshold)} after paying "
+        "for the number of forms tried. This is the safe default; it was not calibrated by simulating this campaign."
+    )
+
+
+def _bar(value: float, top: float) -> float:
+    """Length in percent; square root, so that weak candidates beside a strong one stay visible."""
+    if not (math.isfinite(value) and top > 0.0) or value <= 0.0:
+        return 0.0
+    return round(100.0 * math.sqrt(min(value / top, 1.0)), 2)
+
+
+def _evidence(nats: float) -> str:
+    return f"{nats:.1f}".replace("-0.0", "0.0") if math.isfinite(nats) else number(nats)
+
+
+def _odds(statistic: float) -> str:
+    """Evidence as odds."""
+    if not math.isfinite(statistic):
+        return "–"
+    if statistic > 13.8:
+        return "more than a million to 1"
+    if statistic < 0.0:
+        return f"1 to {count(round(math.exp(min(-statistic, 13.8))))}"
+    return f"{count(round(math.exp(statistic)))} to 1"
+
+
+def _small(p: float) -> str:
+    return "–" if not math.isfinite(p) else ("< 0.0001" if p < 1e-4 else number(p, 2))
+
+
+def _separation(value: float) -> str:
+    """A separation in words."""
+    bounds = ((0.05, "cannot be told apart"), (0.3, "hardly told apart"), (0.7, "partly alike"))
+    return next((word for bound, word in bounds if value < bound), "clearly different")
+
+
+def _rows(points: Iterable[int]) -> str:
+    """Data row numbers, the first below the header being 1, with runs joined, e.g. "4 to 9 and 21"."""
+    runs: list[list[int]] = []
+    for row in sorted(point + 1 for point in points):
+        if runs and row == runs[-1][1] + 1:
+            runs[-1][1] = row
+        else:
+            runs.append([row, row])
+    texts = [str(a) if a == b else f"{a} to {b}" for a, b in runs]
+    return listed(texts[:20]) + (f" and {len(texts) - 20} more" if len(texts) > 20 else "")
+
+
+def _markup(text: str) -> Any:
+    """Text with powers of ten set as print: "(3.6 ± 0.2)e-4" with a raised exponent."""
+    from markupsafe import Markup
+
+    safe = html.escape(text, quote=False).replace(" ± ", "&nbsp;±&nbsp;")
+    safe = re.sub(r"(?<![\w-])-(?=\d)", "−", safe)
+    powers = re.compile(r"(?<=[\d)])e(-?)(\d+)\b")
+    return Markup(powers.sub(lambda found: f"&nbsp;×&nbsp;10<sup>{'−' * len(found[1])}{found[2]}</sup>", safe))
+
+
+def _breakable(name: str) -> Any:
+    """An id that may wrap after each underscore."""
+    from markupsafe import Markup
+
+    return Markup(html.escape(name, quote=False).replace("_", "_<wbr>"))
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("gyromodel")
+    except PackageNotFoundError:
+        return ""
+
+
+def _replace(path: Path, text: str) -> Path:
+    """Write a text file so that no reader ever sees half of it."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+    return path

@@ -1,0 +1,161 @@
+"""What effects see of a campaign: columns in internal units, time since the start, derived signals, and the sampling.
+
+Arrays are padded to a few fixed lengths, so that compiled functions serve every campaign; padded rows count as missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from gyromodel.campaign import Campaign, CampaignError
+from gyromodel.numerics.smoothing import smooth_derivative
+from gyromodel.numerics.state_space import Sampling
+from gyromodel.units import internal_unit
+
+# A step this many times the median one separates stretches of a record.
+GAP = 10.0
+
+
+class Record(NamedTuple):
+    """Signals of one or several campaigns of one unit, laid end to end.
+
+    `output` is a rate-type output (increments divided by their interval, angles differenced); `rows` is the number of real
+    rows before padding; `interval` the nominal sample interval (s); `units` the file's units by column; `blocks` numbers the stretches that replicate one another.
+    """
+
+    signals: dict[str, Float[Array, " sample"]]
+    sampling: Sampling
+    rows: int
+    interval: float
+    output_unit: str
+    units: dict[str, str]
+    blocks: np.ndarray
+    block_scheme: str
+    data_hash: str = ""
+
+    @property
+    def present(self) -> np.ndarray:
+        """Real rows with an output."""
+        return np.asarray(self.sampling.present)[: self.rows]
+
+    def without(self, rows: np.ndarray) -> Record:
+        """The same record with some rows treated as missing."""
+        drop = np.zeros(len(self.sampling.present), bool)
+        drop[: self.rows][rows] = True
+        return self._replace(sampling=self.sampling._replace(present=self.sampling.present & ~drop))
+
+
+def padded_length(rows: int) -> int:
+    """The smallest of 1, 1.25, 1.5, 1.75 × 2^k that holds the rows."""
+    step = max(2 ** (max(rows, 64).bit_length() - 3), 16)
+    return -(-rows // step) * step
+
+
+def rate_output(campaign: Campaign) -> tuple[np.ndarray, str]:
+    """The output as a rate and its internal unit, whatever the campaign recorded."""
+    if "output" not in campaign.columns:
+        axes = ", ".join(campaign.outputs)
+        raise CampaignError(f"{campaign.name}: has outputs {axes}; choose one axis (--axis x, y or z)")
+    output, unit = campaign.si("output"), internal_unit(campaign.units["output"])
+    kind = campaign.metadata["kind"]
+    if kind == "rate":
+        return output, unit
+    if kind == "angle":
+        output = np.diff(output, prepend=np.nan)
+    interval = np.diff(campaign.si("time"), prepend=np.nan)
+    interval[0] = np.median(interval[1:])
+    return output / interval, f"{unit}/s"
+
+
+def _stretches(time: np.ndarray) -> np.ndarray:
+    step = np.diff(time)
+    typical = np.median(step)
+    return np.concatenate([[0], np.cumsum(step > GAP * typical)]).astype(int)
+
+
+def _blocks(campaign: Campaign, time: np.ndarray) -> tuple[np.ndarray, str]:
+    """Stretches that replicate the driver: runs between gaps, else the segment or run column, else equal parts in time."""
+    stretches = _stretches(time)
+    if 4 <= stretches.max() + 1 <= 60:
+        return stretches, "stretches between gaps"
+    for name in ("segment", "run", "position"):
+        if name in campaign.columns:
+            values = campaign.columns[name]
+            numbers = np.unique(values, return_inverse=True)[1]
+            if 4 <= numbers.max() + 1 <= 60:
+                return numbers, f"{name}s"
+    parts = np.minimum((np.arange(len(time)) * 8) // len(time), 7)
+    return parts, "eighths of the record"
+
+
+def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
+    """Lay campaigns of one unit end to end as padded signals in internal units.
+
+    Raises:
+        CampaignError: columns, units or kinds of the campaigns do not match.
+    """
+    campaigns = [campaigns] if isinstance(campaigns, Campaign) else list(campaigns)
+    names = [n for n in campaigns[0].columns if not n.startswith("output")]
+    for other in campaigns[1:]:
+        missing = set(names) ^ {n for n in other.columns if not n.startswith("output")}
+        if missing:
+            raise CampaignError(f"{other.name}: campaigns fitted together need the same columns; {min(missing)} is in only some")
+    parts: dict[str, list[np.ndarray]] = {}
+    blocks, schemes, unit = [], set(), ""
+    for campaign in campaigns:
+        time = campaign.si("time")
+        output, this_unit = rate_output(campaign)
+        if unit and this_unit != unit:
+            raise CampaignError(f"{campaign.name}: output unit {this_unit} differs from {unit} of the first campaign")
+        unit = this_unit
+        columns = {n: campaign.si(n) for n in names}
+        columns["time"] = time - time[0]
+        columns["time_on"] = columns["time"] + float(campaign.metadata.get("time_since_power_on", 0.0))
+        if "temperature" in columns:
+            stretch = _stretches(time)
+            columns["temperature_rate"] = np.concatenate(
+                [_thermometer_rate(time[stretch == s], columns["temperature"][stretch == s]) for s in np.unique(stretch)]
+            )
+        columns["output"] = output
+        step = np.diff(time, prepend=time[0])
+        columns["_interval"], columns["_restart"] = step, np.arange(len(time)) == 0
+        for name, values in columns.items():
+            parts.setdefault(name, []).append(values)
+        block, scheme = _blocks(campaign, time)
+        blocks.append(block + (blocks[-1].max() + 1 if blocks else 0))
+        schemes.add(scheme)
+    signals = {n: np.concatenate(v) for n, v in parts.items()}
+    units = {n: campaigns[0].units[n] for n in names}
+    record = _pad(signals, np.concatenate(blocks), " and ".join(sorted(schemes)), unit, units)
+    return record._replace(data_hash="+".join(c.digest() for c in campaigns))
+
+
+def _thermometer_rate(time: np.ndarray, temperature: np.ndarray) -> np.ndarray:
+    good = np.isfinite(temperature)
+    if good.sum() < 2:
+        return np.full(len(time), np.nan)
+    rate = np.full(len(time), np.nan)
+    rate[good] = smooth_derivative(time[good], temperature[good])
+    return rate
+
+
+def _pad(
+    columns: dict[str, np.ndarray], blocks: np.ndarray, scheme: str, unit: str, units: dict[str, str]
+) -> Record:
+    rows = len(blocks)
+    extra = padded_length(rows) - rows
+    interval, restart, output = columns.pop("_interval"), columns.pop("_restart"), columns["output"]
+    signals = {n: jnp.asarray(np.pad(v, (0, extra), mode="edge")) for n, v in columns.items()}
+    present = np.pad(np.isfinite(output), (0, extra))
+    sampling = Sampling(
+        jnp.asarray(np.pad(interval, (0, extra))),
+        jnp.asarray(np.pad(restart, (0, extra))),
+        jnp.asarray(present),
+        jnp.ones(rows + extra),
+    )
+    return Record(signals, sampling, rows, float(np.median(interval[~restart])), unit, units, blocks, scheme)

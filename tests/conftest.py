@@ -1,0 +1,72 @@
+"""Settings every test shares: compilation cache, seeds that vary by run, hypothesis profile, measured data.
+
+This file must not import gyromodel: the run-time shape checks are installed after it is read and before the package is.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import settings
+from hypothesis.database import DirectoryBasedExampleDatabase
+
+import tests.typechecker  # noqa: F401  the import hook of pyproject.toml looks it up by this name
+
+ROOT = Path(__file__).resolve().parents[1]
+CACHE = ROOT / ".cache"
+
+# Set in the environment, so that test workers and the commands that tests start share them.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE / "jax"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("MPLBACKEND", "agg")
+os.environ.setdefault("GYROMODEL_TEST_SEED", str(secrets.randbelow(2**32)))
+
+settings.register_profile(
+    "gyromodel", deadline=None, print_blob=True, database=DirectoryBasedExampleDatabase(CACHE / "hypothesis")
+)
+settings.load_profile("gyromodel")
+
+
+def pytest_report_header() -> str:
+    """Show the seed of the statistical tests, as every run draws its own."""
+    return f"GYROMODEL_TEST_SEED={os.environ['GYROMODEL_TEST_SEED']} repeats this run's random draws"
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item):
+    """Print the seed with each failure too: workers show no header."""
+    report = yield
+    if report.failed:
+        report.sections.append(("seed", f"GYROMODEL_TEST_SEED={os.environ['GYROMODEL_TEST_SEED']}"))
+    return report
+
+
+@pytest.fixture
+def seed(request: pytest.FixtureRequest) -> int:
+    """A seed that differs between runs and between tests; GYROMODEL_TEST_SEED repeats a run."""
+    name = int.from_bytes(request.node.nodeid.encode(), "big")
+    return int(np.random.SeedSequence([int(os.environ["GYROMODEL_TEST_SEED"]), name]).generate_state(1)[0])
+
+
+@pytest.fixture
+def rng(seed: int) -> np.random.Generator:
+    """A generator started at `seed`."""
+    return np.random.default_rng(seed)
+
+
+@pytest.fixture(scope="session")
+def measured_data() -> Callable[[str], Path]:
+    """Path of a measured data file by its name; skips the test where the data are absent."""
+    folder = Path(os.environ.get("GYROMODEL_DATA", ROOT.parent / "shared" / "data"))
+
+    def path(name: str) -> Path:
+        if not (folder / name).exists():
+            pytest.skip(f"measured data {name} not found; GYROMODEL_DATA names their folder")
+        return folder / name
+
+    return path

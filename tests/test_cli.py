@@ -1,0 +1,373 @@
+"""The command line against its contract: commands, exit status, one readable sentence on error, `--json`.
+
+Expected values are the contract's, and for the demo the published ring laser table: eight of its twelve points lie on a
+line and the points at 30, 50, 70 and 110 deg/s do not (the line and the misses follow from the printed counts).
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gyromodel import cli
+
+COMMANDS = ("demo", "fit", "diagnose", "simulate", "effects")
+HEAVY = {"jax", "equinox", "numpy", "pandas", "pint", "matplotlib", "xarray", "scipy", "rich"}
+
+PLAN = """\
+gyro: fog
+kind: rate
+duration: 2 h
+interval: 20 s
+output: count/s
+columns:
+  rate:
+    - repeat: 6
+      segments: [{for: 10 min, at: 10 deg/s}, {for: 10 min, at: -10 deg/s}]
+  temperature:
+    - {for: 1 h, from: 20 degC, to: 50 degC}
+    - {for: 1 h, to: 20 degC}
+"""
+TRUTH = """\
+gyro: fog
+effects:
+  - effect: scale_factor
+    value: 1000 count/deg
+  - effect: bias
+    value: 5 deg/h
+noise:
+  - {effect: noise_white, value: 0.02 deg/sqrt(h)}
+"""
+SIMULATION = """\
+gyro: fog
+effects:
+  - effect: scale_factor
+  - effect: bias
+noise: auto
+"""
+CAMPAIGN = """\
+# kind: rate
+time [s],rate [deg/s],output [count/s]
+0,0,1
+1,1,1002
+2,-1,-999
+3,2,2001
+"""
+
+
+@dataclass
+class Outcome:
+    status: int
+    out: str
+    err: str
+
+
+Run = Callable[..., Outcome]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Run the command line in this process."""
+    monkeypatch.delenv("GYROMODEL_DEBUG", raising=False)
+
+    def call(*arguments: object) -> Outcome:
+        with pytest.raises(SystemExit) as ended:
+            cli.main([str(argument) for argument in arguments])
+        code = ended.value.code
+        captured = capsys.readouterr()
+        return Outcome(code if isinstance(code, int) else 0, captured.out, captured.err)
+
+    return call
+
+
+@pytest.fixture
+def bench(tmp_path: Path, run: Run) -> Path:
+    """A folder with a simulated campaign, the model behind it and the model to fit."""
+    for name, text in {"plan.yaml": PLAN, "truth.yaml": TRUTH, "simulation.yaml": SIMULATION}.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    made = run("simulate", tmp_path / "truth.yaml", "--plan", tmp_path / "plan.yaml", "-o", tmp_path / "campaign.csv")
+    assert made.status == 0, made.err
+    return tmp_path
+
+
+def refusal(outcome: Outcome) -> str:
+    """The one sentence of a command that could not answer."""
+    assert outcome.status == 1, outcome
+    assert outcome.err.startswith("gyromodel: ")
+    assert outcome.err.count("\n") == 1
+    assert "Traceback" not in outcome.err
+    assert "internal error" not in outcome.err
+    return outcome.err
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["effects"], ["effects", "bias"], ["fit", "--help"]])
+def test_commands_that_compute_nothing_load_nothing_heavy(arguments: list[str]):
+    code = (
+        "import sys, atexit\n"
+        f"atexit.register(lambda: print('loaded', *sorted({HEAVY!r} & set(sys.modules))))\n"
+        f"from gyromodel.cli import main; main({arguments!r})"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1].strip() == "loaded"
+
+
+def test_help_lists_every_command(run: Run):
+    shown = run("--help")
+    assert shown.status == 0
+    assert all(f"\n  {command} " in shown.out for command in COMMANDS)
+
+
+def test_the_module_runs_as_a_program():
+    done = subprocess.run([sys.executable, "-m", "gyromodel", "fit"], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "Missing argument" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["fits"],
+        ["fit"],
+        ["fit", "campaign.csv"],
+        ["fit", "campaign.csv", "--model", "m.yaml"],
+        ["diagnose", "campaign.csv", "--model", "m.yaml", "-o", "out", "--axis", "w"],
+        ["diagnose", "campaign.csv", "--model", "m.yaml", "-o", "out", "--calibrate", "-1"],
+        ["diagnose", "campaign.csv", "--model", "m.yaml", "-o", "out", "--seed", "one"],
+        ["simulate", "m.yaml", "-o", "out.csv"],
+        ["simulate", "m.yaml", "-o", "out.csv", "--like", "a.csv", "--plan", "b.yaml"],
+        ["effects", "bias_temprature"],
+        ["effects", "--unknown"],
+    ],
+)
+def test_wrong_usage_ends_with_status_2(run: Run, arguments: list[str]):
+    outcome = run(*arguments)
+    assert outcome.status == 2
+    assert outcome.err
+    assert "Traceback" not in outcome.err
+
+
+def test_a_misspelt_effect_is_met_with_the_nearest(run: Run):
+    assert "bias_temperature" in run("effects", "bias_temprature").err
+
+
+def test_effects_lists_the_catalogue(run: Run):
+    shown = run("effects")
+    assert shown.status == 0
+    assert {"scale_factor", "bias_temperature_rate"} <= {line.split()[0] for line in shown.out.splitlines()}
+
+
+def test_effects_shows_one_entry_in_full(run: Run):
+    shown = run("effects", "bias_temperature_rate")
+    for part in ("Shupe", "deg/h/(degC/s)", "temperature", "fiber coil", "ramp speeds"):
+        assert part in shown.out
+
+
+def test_effects_as_json(run: Run):
+    listed = json.loads(run("effects", "--json").out)
+    one = json.loads(run("effects", "scale_factor", "--json").out)
+    assert one in listed
+    assert one["id"] == "scale_factor"
+    assert {"equation", "needs", "cause", "test", "parameters"} <= set(one)
+
+
+def test_simulate_repeats_with_its_seed_and_differs_without(bench: Path, run: Run):
+    def simulated(seed: int, name: str) -> bytes:
+        made = run(
+            "simulate", bench / "truth.yaml", "--like", bench / "campaign.csv", "--seed", seed, "-o", bench / name
+        )
+        assert made.status == 0, made.err
+        return (bench / name).read_bytes()
+
+    assert simulated(3, "a.csv") == simulated(3, "b.csv")
+    assert simulated(3, "a.csv") != simulated(4, "c.csv")
+
+
+@pytest.mark.parametrize("name", ["made.csv.gz", "made.parquet", "made.nc", "made.zarr", "new/folder/made.csv"])
+def test_simulate_writes_every_format(bench: Path, run: Run, name: str):
+    made = run("simulate", bench / "truth.yaml", "--like", bench / "campaign.csv", "-o", bench / name, "--json")
+    assert made.status == 0, made.err
+    said = json.loads(made.out)
+    assert said["rows"] == 360
+    assert (bench / name).exists()
+
+
+def test_fit_recovers_the_simulated_values(bench: Path, run: Run):
+    out = bench / "results" / "fit"
+    done = run("fit", bench / "campaign.csv", "--model", bench / "simulation.yaml", "-o", out, "--json")
+    assert done.status == 0, done.err
+    said = json.loads(done.out)
+    assert said == json.loads((out / "fit.json").read_text(encoding="utf-8"))
+    bias = next(row for row in said["parameters"] if row["effect"] == "bias")
+    assert bias["unit"] == "deg/h"
+    assert abs(bias["value"] - 5.0) < 5.0 * bias["std"]
+    assert 0 < bias["std"] < 1.0
+
+
+def test_fit_prints_a_table_and_its_paths(bench: Path, run: Run):
+    done = run("fit", bench / "campaign.csv", "--model", bench / "simulation.yaml", "-o", bench / "out")
+    assert done.status == 0, done.err
+    for part in ("scale_factor", "count/s", "±", "noise_white", "model.yaml", "fit.json"):
+        assert part in done.out, part
+
+
+def test_a_fitted_model_is_an_input_of_every_command(bench: Path, run: Run):
+    fitted = bench / "out" / "model.yaml"
+    campaign = bench / "campaign.csv"
+    assert run("fit", campaign, "--model", bench / "simulation.yaml", "-o", bench / "out").status == 0
+    assert run("simulate", fitted, "--like", campaign, "-o", bench / "again.csv").status == 0
+    refit = run("fit", bench / "again.csv", "--model", fitted, "-o", bench / "refit")
+    assert refit.status == 0, refit.err
+
+
+def test_diagnose_writes_its_results(bench: Path, run: Run):
+    out = bench / "diagnosis"
+    done = run("diagnose", bench / "campaign.csv", "--model", bench / "simulation.yaml", "-o", out)
+    assert done.status == 0, done.err
+    said = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
+    assert said["verdict"] in {"adequate", "named", "ambiguous", "unknown"}
+    assert {"causes", "driver", "gain", "next_test", "minimum_detectable", "not_testable", "noise"} <= set(said)
+    assert (out / said["model"]).is_file()
+    assert (out / "report.html").stat().st_size > 1000
+    assert any((out / "figures").iterdir())
+    for name in ("report.html", "diagnosis.json", "model.yaml"):
+        assert str(out / name) in done.out
+    assert not [path for path in out.rglob("*") if path.name.startswith(".")]
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """The demo's folder and what it printed as JSON, from another directory and another process."""
+    place = tmp_path_factory.mktemp("anywhere")
+    command = [sys.executable, "-m", "gyromodel", "demo", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=place)
+    assert done.returncode == 0, done.stderr
+    return place / "gyromodel-demo", json.loads(done.stdout)
+
+
+def test_demo_writes_its_results_beside_the_inputs(demo: tuple[Path, dict[str, Any]]):
+    folder, said = demo
+    for name, place in {"ring_laser": folder, "fiber_optic": folder / "fiber_optic"}.items():
+        assert said[name] == json.loads((place / "diagnosis.json").read_text(encoding="utf-8"))
+        for file in ("report.html", "model.yaml", "campaign.csv", "simulation.yaml"):
+            assert (place / file).is_file()
+
+
+def test_demo_finds_the_four_anomalous_points(demo: tuple[Path, dict[str, Any]]):
+    said = demo[1]["ring_laser"]
+    assert said["verdict"] == "ambiguous"
+    assert [3, 5, 7, 11] in [sorted(cause["points"]) for cause in said["causes"]]
+    assert said["next_test"]
+
+
+def test_demo_names_the_hidden_effect_and_its_size(demo: tuple[Path, dict[str, Any]]):
+    said = demo[1]["fiber_optic"]
+    assert said["verdict"] == "named"
+    assert [cause["effect"] for cause in said["causes"]] == ["bias_temperature_rate"]
+    found = said["causes"][0]["parameters"][0]
+    assert found["unit"] == "deg/h/(degC/s)"
+    assert abs(found["value"] - 40.0) < 4.0 * found["std"]
+    assert said["gain"]["ci95"][0] > 1.0
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (CAMPAIGN.replace("output [count/s]", "output"), "output"),
+        (CAMPAIGN.replace("[count/s]", "[counts per blink]"), "output"),
+        (CAMPAIGN.replace("# kind: rate\n", ""), "kind"),
+        (CAMPAIGN.replace("2,-1", "0.5,-1"), "increas"),
+        (CAMPAIGN.replace("1002", "many"), "many"),
+        (CAMPAIGN.replace("output", "output_x"), "axis"),
+        (CAMPAIGN.replace("rate [deg/s]", "speed [deg/s]"), "rate"),
+        (CAMPAIGN.replace("time [s]", "clock [s]"), "time"),
+        ("", "campaign.csv"),
+        ("\x00\xff", "campaign.csv"),
+    ],
+)
+def test_bad_data_ends_with_status_1_and_a_sentence(tmp_path: Path, run: Run, text: str, expected: str):
+    (tmp_path / "campaign.csv").write_text(text, encoding="latin-1")
+    (tmp_path / "model.yaml").write_text(SIMULATION, encoding="utf-8")
+    outcome = run("fit", tmp_path / "campaign.csv", "--model", tmp_path / "model.yaml", "-o", tmp_path / "out")
+    assert expected in refusal(outcome)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "empty"),
+        ("effects: [", "line 1"),
+        ("effects:\n  - effect: bias_temprature_of_what\n    values: 3", "line"),
+        (SIMULATION.replace("bias", "bias_temperature"), "temperature"),
+        (SIMULATION.replace("effects", "efects"), "efects"),
+        (SIMULATION + "  - effect: bias\n", "line"),
+        (SIMULATION.replace("auto", "loud"), "noise"),
+    ],
+)
+def test_a_bad_model_ends_with_status_1_and_a_sentence(tmp_path: Path, run: Run, text: str, expected: str):
+    (tmp_path / "campaign.csv").write_text(CAMPAIGN, encoding="utf-8")
+    (tmp_path / "model.yaml").write_text(text, encoding="utf-8")
+    outcome = run("diagnose", tmp_path / "campaign.csv", "--model", tmp_path / "model.yaml", "-o", tmp_path / "out")
+    assert expected in refusal(outcome)
+
+
+@pytest.mark.parametrize("command", ["fit", "diagnose"])
+def test_missing_files_are_named(tmp_path: Path, run: Run, command: str):
+    (tmp_path / "model.yaml").write_text(SIMULATION, encoding="utf-8")
+    no_data = run(command, tmp_path / "nothing.csv", "--model", tmp_path / "model.yaml", "-o", tmp_path / "out")
+    assert "nothing.csv" in refusal(no_data)
+    (tmp_path / "campaign.csv").write_text(CAMPAIGN, encoding="utf-8")
+    no_model = run(command, tmp_path / "campaign.csv", "--model", tmp_path / "nothing.yaml", "-o", tmp_path / "out")
+    assert "nothing.yaml" in refusal(no_model)
+
+
+def test_an_output_folder_that_is_a_file_is_refused_before_the_work(bench: Path, run: Run):
+    (bench / "taken").write_text("", encoding="utf-8")
+    outcome = run("fit", bench / "nothing.csv", "--model", bench / "simulation.yaml", "-o", bench / "taken")
+    assert "taken" in refusal(outcome)
+
+
+def test_unknown_suffix_is_refused(bench: Path, run: Run):
+    outcome = run("simulate", bench / "truth.yaml", "--plan", bench / "plan.yaml", "-o", bench / "campaign.xyz")
+    assert ".xyz" in refusal(outcome)
+
+
+def test_inputs_are_never_overwritten(bench: Path, run: Run):
+    (bench / "model.yaml").write_text(SIMULATION, encoding="utf-8")
+    campaign, truth = bench / "campaign.csv", bench / "truth.yaml"
+    before = campaign.read_bytes()
+    assert run("fit", campaign, "--model", bench / "model.yaml", "-o", bench).status == 2
+    assert run("diagnose", campaign, "--model", bench / "model.yaml", "-o", bench).status == 2
+    assert run("simulate", truth, "--like", campaign, "-o", campaign).status == 2
+    assert (bench / "model.yaml").read_text(encoding="utf-8") == SIMULATION
+    assert campaign.read_bytes() == before
+
+
+def test_what_nobody_foresaw_is_one_sentence_too(bench: Path, run: Run, monkeypatch: pytest.MonkeyPatch):
+    def broken(path: Path) -> None:
+        raise RuntimeError("broken\nin two lines")
+
+    monkeypatch.setattr("gyromodel.files.read_campaign", broken)
+    arguments = ("fit", bench / "campaign.csv", "--model", bench / "simulation.yaml", "-o", bench / "out")
+    outcome = run(*arguments)
+    assert outcome.status == 1
+    assert outcome.err.count("\n") == 1
+    assert "internal error (RuntimeError: broken in two lines); please report" in outcome.err
+    monkeypatch.setenv("GYROMODEL_DEBUG", "1")
+    with pytest.raises(RuntimeError, match="broken"):
+        cli.main([str(argument) for argument in arguments])
+
+
+def test_json_has_null_where_there_is_no_number():
+    assert json.loads(cli._json({"a": float("nan"), "b": [float("inf"), 1.5], 3: ("x", None)})) == {
+        "a": None,
+        "b": [None, 1.5],
+        "3": ["x", None],
+    }

@@ -1,0 +1,337 @@
+"""The simulators are right: expected numbers are closed forms (Allan variances and PSDs of the noise table, diffusion
+into a slab, the Sagnac sine, power of a z-test), never the package's own output."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.stats import binomtest, kstest, kurtosis, norm
+from scipy.stats import t as student_t
+
+from tests.truth import contest, noise, study
+from tests.truth.campaigns import TESTABLE, UNCATALOGUED, A, B, C, hide
+from tests.truth.designs import DESIGNS
+from tests.truth.effects import EFFECTS, UNKNOWN, coil_temperature_rate, draw_shape, error
+from tests.truth.mde import REGULAR, SCAN, amplitude, baseline, oracle, simpler, target
+
+RARE = 1e-5  # chance that a right simulator fails one statistical check
+
+
+@pytest.fixture
+def seed(record_property) -> int:
+    value = int(np.random.SeedSequence().generate_state(1)[0])
+    record_property("seed", value)
+    print(f"seed {value}")  # pytest shows it on failure
+    return value
+
+
+@pytest.fixture
+def rng(seed) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def allan_variance(rate: np.ndarray, m: int) -> float:
+    """Overlapping Allan variance of rate samples averaged over m."""
+    mean = np.convolve(rate, np.full(m, 1 / m), mode="valid")
+    return float(0.5 * np.mean((mean[m:] - mean[:-m]) ** 2))
+
+
+def mean_allan(draw, m: int, runs: int) -> tuple[float, float]:
+    """Mean over runs, and its standard error."""
+    values = [allan_variance(draw(), m) for _ in range(runs)]
+    return float(np.mean(values)), float(np.std(values, ddof=1) / np.sqrt(runs))
+
+
+def allan_from_psd(alpha: float, coefficient: float, tau: float) -> float:
+    """sigma^2 = 4 int_0^inf S(f) sin^4(pi f tau)/(pi f tau)^2 df for two-sided S = coefficient^2/(2 pi f)^alpha."""
+
+    def integrand(u: float) -> float:  # u = pi f tau
+        return np.sin(u) ** 4 / u**2 / (2 * u / tau) ** alpha
+
+    total = sum(quad(integrand, k * np.pi, (k + 1) * np.pi)[0] for k in range(400))
+    return 4 * coefficient**2 * total / (np.pi * tau)
+
+
+def test_allan_integral_agrees_with_the_noise_table():
+    assert allan_from_psd(0.0, 2.0, 3.0) == pytest.approx(2.0**2 / 3.0, rel=2e-3)
+    assert allan_from_psd(1.0, 2.0, 3.0) == pytest.approx(2 * np.log(2) / np.pi * 2.0**2, rel=1e-5)
+    assert allan_from_psd(2.0, 2.0, 3.0) == pytest.approx(2.0**2 * 3.0 / 3, rel=1e-5)
+
+
+def test_white_noise_has_allan_variance_over_tau(rng):
+    measured, se = mean_allan(lambda: noise.white(4000, 0.5, 3.0, rng), 20, 100)
+    assert abs(measured - 3.0**2 / (20 * 0.5)) < norm.isf(RARE) * se
+
+
+@pytest.mark.parametrize(("alpha", "m"), [(1.0, 64), (1.5, 64), (2.0, 64)])
+def test_fractional_noise_has_the_allan_variance_of_its_psd(alpha, m, rng):
+    step, coefficient = 0.5, 3.0
+    measured, se = mean_allan(lambda: noise.fractional(4000, step, coefficient, alpha, rng), m, 150)
+    expected = allan_from_psd(alpha, coefficient, m * step)
+    assert abs(measured - expected) < norm.isf(RARE) * se + 0.01 * expected  # 1 %: sampled, not continuous
+
+
+def test_named_fractional_noises_are_flicker_and_random_walk(seed):
+    def generator() -> np.random.Generator:
+        return np.random.default_rng(seed)
+
+    assert np.array_equal(noise.flicker(50, 2.0, 0.3, generator()), noise.fractional(50, 2.0, 0.3, 1.0, generator()))
+    walk = noise.random_walk(50_000, 2.0, 0.3, generator())
+    assert np.diff(walk).std() == pytest.approx(0.3 * np.sqrt(2.0), rel=0.03)
+    assert kstest(np.diff(walk) / (0.3 * np.sqrt(2.0)), "norm").pvalue > RARE
+
+
+def test_markov_noise_peaks_where_the_table_says(rng):
+    step, q, Tc = 0.1, 2.0, 5.0
+    m = round(1.89 * Tc / step)
+    measured, se = mean_allan(lambda: noise.markov(20_000, step, q, Tc, rng), m, 60)
+    expected = (0.437 * q * np.sqrt(Tc)) ** 2
+    assert abs(measured - expected) < norm.isf(RARE) * se + 0.01 * expected
+    for other in (m // 3, 3 * m):
+        assert mean_allan(lambda other=other: noise.markov(20_000, step, q, Tc, rng), other, 60)[0] < measured
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        (name, kind)
+        for name in DESIGNS
+        for kind in (*noise.FAMILY, *noise.OUTSIDE)
+        if kind != "grows_with_rate" or name in (A, C)
+    ],
+)
+def test_dense_covariance_is_that_of_the_samples(name, kind, rng):
+    design = DESIGNS[name](rng)
+    law = noise.draw(kind, design, rng)
+    whiten = oracle(design, law, ())
+    runs = 40
+    z = whiten.reduce(np.column_stack([law.sample(design, rng) for _ in range(runs)]))
+    # every direction: independent unit normals; slow directions apart, where a wrong history would show
+    slow = np.linalg.qr(whiten.reduce(np.vander(design.true["time"] / design.true["time"][-1], 4)))[0]
+    chosen = slow.T @ z
+    assert abs(np.sum(chosen**2) - chosen.size) < norm.isf(RARE) * np.sqrt(2 * chosen.size) * 1.3
+    if kind == "student_t3":
+        assert kstest(z[::7].ravel() * np.sqrt(3), student_t(3).cdf).pvalue > RARE
+        assert kurtosis(z.ravel()) > 3
+    else:
+        assert abs(np.sum(z**2) - z.size) < norm.isf(RARE / 2) * np.sqrt(2 * z.size)
+        assert kstest(z[::7].ravel(), "norm").pvalue > RARE
+
+
+@pytest.mark.parametrize(
+    ("kind", "column", "name"), [("grows_with_rate", "rate", C), ("grows_with_temperature_rate", "temperature_rate", B)]
+)
+def test_growing_noise_is_three_times_larger_at_the_extreme(kind, column, name, rng):
+    design = DESIGNS[name](rng)
+    sigma = np.sqrt(np.diag(noise.draw(kind, design, rng).covariance(design)))
+    size = np.abs(design.true[column])
+    assert sigma[size.argmax()] / sigma[size.argmin()] == pytest.approx(3.0, rel=0.02)
+    assert np.all(np.diff(sigma[np.argsort(size)]) >= -1e-12 * sigma.max())
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+def test_designs_are_campaigns_that_could_have_been(name, rng):
+    design = DESIGNS[name](rng)
+    n = len(design.index)
+    assert 850 <= n <= 1050
+    assert set(design.columns) == set(design.units)
+    assert next(iter(design.columns)) == "time"
+    assert np.array_equal(design.true["time"], design.index * design.step)
+    assert np.all(np.diff(design.index) >= 1)
+    error_of_thermometer = design.columns["temperature"] - design.true["temperature"]
+    assert error_of_thermometer.std() == pytest.approx(2e-3, rel=0.15)
+    wandering = [c for c in ("supply_voltage", "pressure", "laser_current") if c in design.columns]
+    others = np.array([design.true[c] for c in ("temperature", "temperature_rate", *wandering)])
+    if wandering:
+        together = np.abs(np.corrcoef(others) - np.eye(len(others)))
+        assert together.max() < 0.97  # not collinear
+    for c in wandering:
+        assert design.columns[c] == pytest.approx(design.true[c], rel=0.01)
+
+
+def test_each_design_does_what_it_is_for(rng):
+    a, b, c, d = (make(rng) for make in DESIGNS.values())
+    assert len(np.unique(a.columns["segment"])) == 11
+    assert np.sum(np.diff(a.index) > 10) == 10
+    for segment in range(11):
+        rows = a.columns["segment"] == segment
+        assert len(np.unique(a.columns["rate"][rows])) == 21
+        assert np.ptp(a.true["temperature"][rows]) < 12
+    order = np.diff(np.unique(a.columns["segment"], return_index=True)[1])
+    assert np.all(order > 0)
+    assert not b.rotates
+    assert not d.rotates
+    fast = b.true["temperature_rate"]
+    speeds = [np.median(fast[(fast > 0.8 * fast.max())]), -np.median(fast[fast < 0.8 * fast.min()])]
+    assert max(speeds) / min(speeds) > 1.3  # at least two ramp speeds
+    assert np.mean(np.abs(fast) < 0.15 * np.abs(fast).max()) > 0.1  # soaks
+    levels = np.unique(c.columns["rate"])
+    assert np.sum(levels > 1e-9) >= 10
+    assert np.sum(levels < -1e-9) >= 10
+    assert np.abs(levels).max() <= 100
+    assert np.all(np.diff(d.true["temperature"]) >= 0)
+    assert np.corrcoef(d.true["temperature"], d.true["time"])[0, 1] > 0.995
+
+
+def test_coil_follows_a_steady_ramp_exactly():
+    time = np.arange(0, 2000.0, 2.0)
+    rate = coil_temperature_rate(time, 20 + 0.01 * time, 60.0)
+    assert rate[time > 400] == pytest.approx(0.01, rel=1e-6)
+
+
+def test_coil_answers_a_sine_as_a_slab_does():
+    """Mean over mean-surface transfer of an insulated slab: tanh(q)/q, q = sqrt(i omega tau)."""
+    tau, omega = 60.0, 2 * np.pi / 300
+    time = np.arange(0, 6000.0, 0.5)
+    rate = coil_temperature_rate(time, np.sin(omega * time), tau)
+    late = time > 3000
+    basis = np.column_stack([np.sin(omega * time), np.cos(omega * time)])[late]
+    s, c = np.linalg.lstsq(basis, rate[late], rcond=None)[0]
+    q = np.sqrt(1j * omega * tau)
+    expected = 1j * omega * np.tanh(q) / q  # rate of the mean for a surface of exp(i omega t)
+    assert s + 1j * c == pytest.approx(expected, rel=5e-3)
+
+
+def test_shupe_is_proportional_to_slow_temperature_rate(rng):
+    design = DESIGNS[B](rng)
+    shape = draw_shape("bias_temperature_rate", design, rng)
+    wrong = error("bias_temperature_rate", design, 2.0, shape)
+    assert np.corrcoef(wrong, design.true["temperature_rate"])[0, 1] > 0.99
+    slope = np.polyfit(design.true["temperature_rate"], wrong, 1)[0]
+    assert slope == pytest.approx(2.0, rel=0.1)
+
+
+def test_open_loop_fog_answers_with_the_sine_of_the_sagnac_phase(rng):
+    design = DESIGNS[C](rng)
+    rate = design.true["rate"]
+    for kappa in (0.003, 0.05, 0.4):
+        wrong = error("scale_sagnac_sine", design, kappa, {})
+        assert wrong == pytest.approx(np.sin(kappa * rate) / kappa - rate, abs=1e-11 * np.abs(rate).max())
+    cubic = -(0.05**2) * rate**3 / 6
+    assert error("scale_sagnac_sine", design, 0.05, {}) == pytest.approx(cubic, rel=1e-3, abs=1e-12)
+
+
+def test_simple_effects_follow_their_equations(rng):
+    a = DESIGNS[A](rng)
+    rate, T, t = a.true["rate"], a.true["temperature"], a.true["time"]
+    full = np.abs(rate).max()
+    mix = np.array([1.0, -2.0, 0.0, 0.5])
+    expected = {
+        "scale_factor": ({}, rate),
+        "scale_asymmetry": ({}, 0.5 * np.abs(rate)),
+        "scale_nonlinearity": ({"mix": mix}, rate**2 / full - 2 * rate**3 / full**2 + 0.5 * rate**5 / full**4),
+        "scale_temperature": ({}, (T - 20) * rate),
+        "scale_temperature_curve": ({"kind": "parabola", "at": 7.0}, (T - 7) ** 2 * rate),
+        "bias": ({}, np.ones_like(t)),
+        "bias_temperature": ({}, T - 20),
+        "bias_temperature_curve": ({"kind": "bend", "at": 7.0}, np.where(T > 7, T - 7, 0)),
+        "bias_drift": ({}, t),
+        "bias_step": ({"at": 1234.5}, 1.0 * (t > 1234.5)),
+        "bias_warmup": ({"tau": 700.0}, np.exp(-t / 700)),
+        "bias_periodic": ({"frequency": 0.001, "phase": np.pi / 2}, np.cos(2 * np.pi * 0.001 * t)),
+        "bias_supply_voltage": ({}, a.true["supply_voltage"] - a.true["supply_voltage"].mean()),
+    }
+    for name, (shape, values) in expected.items():
+        assert error(name, a, 3.0, shape) == pytest.approx(3.0 * values, rel=1e-9, abs=1e-12), name
+
+
+def _every_hidden() -> list[tuple[str, str]]:
+    return [(d, e) for table in (TESTABLE, UNCATALOGUED) for d, names in table.items() for e in names]
+
+
+@pytest.mark.parametrize(("name", "effect"), _every_hidden())
+def test_hidden_effects_have_the_size_asked_for(name, effect, rng):
+    design = DESIGNS[name](rng)
+    law = noise.draw("flicker", design, rng)
+    columns, units, metadata, truth = hide(effect, design, law, 3.0, rng)
+    judge = oracle(design, law, baseline(design, effect) + simpler(effect))
+    assert judge.norm(truth.error) == pytest.approx(3 * target(effect), rel=1e-6)
+    assert effect not in truth.baseline
+    assert set(columns) == set(units) == {*design.columns, "output"}
+    assert metadata["kind"] == "rate"
+    modelled = (design.true["rate"] + truth.error + truth.bias) * (1 + truth.scale_error) + truth.noise
+    assert np.deg2rad(columns["output"]) == pytest.approx(modelled, rel=2e-3, abs=1e-9)
+    assert truth.driver == (UNKNOWN[effect][1] if effect in UNKNOWN else None)
+    assert (effect in EFFECTS) != (effect in UNKNOWN)
+
+
+def test_nothing_hidden_leaves_only_noise_for_the_baseline(rng):
+    design = DESIGNS[A](rng)
+    law = noise.draw("flicker", design, rng)
+    columns, _, _, truth = hide(None, design, law, 0.0, rng)
+    judge = oracle(design, law, baseline(design))
+    left = judge.reduce(np.deg2rad(columns["output"])[:, None])[:, 0]
+    assert left == pytest.approx(judge.reduce(truth.noise[:, None])[:, 0], abs=1e-5)
+    assert abs(left @ left - len(left)) < norm.isf(RARE) * np.sqrt(2 * len(left)) + 2
+
+
+@pytest.mark.parametrize("kind", noise.FAMILY[:3])
+def test_z_test_of_the_oracle_has_the_power_the_mde_promises(kind, rng):
+    """At lambda = 4.3 and 1 %/20 false alarms a two-sided z-test finds the effect in 79-80 %."""
+    found, runs = 0, 400
+    limit = norm.isf(0.01 / 20 / 2)
+    design = DESIGNS[B](rng)
+    law = noise.draw(kind, design, rng)
+    judge = oracle(design, law, ("bias",))
+    size = amplitude("bias_pressure", design, law, {}, 1.0)
+    wrong = error("bias_pressure", design, size, {})
+    u = judge.reduce(wrong[:, None])[:, 0]
+    assert np.linalg.norm(u) == pytest.approx(REGULAR)
+    data = np.column_stack([wrong + law.sample(design, rng) for _ in range(runs)])
+    found = int(np.sum(np.abs(u @ judge.reduce(data)) / REGULAR > limit))
+    power = float(norm.sf(limit - REGULAR))
+    assert power == pytest.approx(0.80, abs=0.02)
+    assert binomtest(found, runs, power).pvalue > RARE
+
+
+def test_scan_for_a_step_has_about_the_power_the_mde_promises(rng):
+    """Over every epoch, at 1 %/20 false alarms: about 80 % at lambda = 5.5 (70-95 % from method's 17-53 trials)."""
+    design = DESIGNS[B](rng)
+    law = noise.draw("white", design, rng)
+    judge = oracle(design, law, ("bias",))
+    unit = contest.reduced(judge, {"s": contest.library(design, None)["bias_step"]})["s"][:, :, 0]
+    peaks = np.concatenate([np.abs(unit.T @ rng.standard_normal((len(unit), 2000))).max(0) for _ in range(10)])
+    limit = np.quantile(peaks, 1 - 0.01 / 20)
+    at = draw_shape("bias_step", design, rng)
+    size = amplitude("bias_step", design, law, at, 1.0)
+    wrong = judge.reduce(error("bias_step", design, size, at)[:, None])
+    assert np.linalg.norm(wrong) == pytest.approx(SCAN)
+    power = np.mean(np.abs(unit.T @ (wrong + rng.standard_normal((len(unit), 2000)))).max(0) > limit)
+    assert 0.70 < power < 0.97
+
+
+def test_oracle_names_a_strong_effect_and_least_squares_is_fooled_by_flicker(seed):
+    records = study.run_cases(study.effect_cases(17, seed, 3.0), engine=False)
+    assert sum(r.oracle_first == r.case.effect for r in records) >= 15
+    nulls = study.run_cases(study.null_cases(6, seed, ("flicker", "random_walk")), engine=False, controls=True)
+    assert sum(bool(r.controls["least_squares_f"].added) for r in nulls) >= 3
+
+
+def test_cases_reproduce_and_cover_every_design_and_noise(seed):
+    cases = study.effect_cases(17 * 9, seed, 3.0)
+    assert {(c.design, c.noise) for c in cases} == {(d, n) for d in (A, B, C) for n in noise.FAMILY[:3]}
+    assert {c.effect for c in cases} == {e for d in (A, B, C) for e in TESTABLE[d]}
+    assert len({c.seed for c in cases}) == len(cases)
+    one, two = study.build(cases[0]), study.build(cases[0])
+    assert all(np.array_equal(one.columns[k], two.columns[k]) for k in one.columns)
+
+
+def test_levels_come_from_the_binomial_law():
+    exact = study.Level("1", "", "", 0.02, False, 2, 400)
+    assert exact.interval == pytest.approx((0.00061, 0.01794), abs=1e-4)  # Clopper-Pearson tables
+    assert exact.met
+    assert not study.Level("1", "", "", 0.02, False, 20, 400).met
+    assert study.Level("1", "", "", 0.02, False, 4, 60).plausible
+    assert not study.Level("1", "", "", 0.02, False, 6, 60).plausible
+    assert not study.Level("5", "", "", 0.92, True, 80, 100).plausible
+
+
+def test_simulators_share_no_code_with_the_package():
+    import subprocess
+    import sys
+
+    code = (
+        "import sys, tests.truth.study; sys.exit(any(m.partition('.')[0] in ('gyromodel', 'jax') for m in sys.modules))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,77 @@
+"""Campaigns with one hidden effect of a known size: what the engine is shown, and what it should say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from .designs import Design
+from .effects import EFFECTS, UNKNOWN, draw_shape, error
+from .mde import amplitude, baseline
+from .noise import Noise
+
+Array = np.ndarray
+
+A, B, C = "rate_temperature", "static_cycle", "rate_steps"
+_TIME = ("bias_drift", "bias_step", "bias_warmup", "bias_periodic")
+_SCALE = ("scale_factor", "scale_asymmetry", "scale_nonlinearity", "scale_sagnac_sine")
+_THERMAL = ("bias_temperature", "bias_temperature_curve")
+TESTABLE: dict[str, tuple[str, ...]] = {  # catalogue effects that each design can show
+    A: (*_SCALE, "scale_temperature", "scale_temperature_curve", "bias", *_THERMAL, *_TIME, "bias_supply_voltage"),
+    B: ("bias", *_THERMAL, "bias_temperature_rate", *_TIME, "bias_supply_voltage", "bias_pressure",
+        "bias_laser_current"),
+    C: (*_SCALE, "scale_temperature", "bias", "bias_temperature", *_TIME),
+    "static_ramp": ("bias_temperature", "bias_drift"),
+}  # fmt: skip
+UNCATALOGUED: dict[str, tuple[str, ...]] = {
+    A: ("temperature_ripple", "rate_ripple", "supply_voltage_ripple", "rate_temperature_bump"),
+    B: ("temperature_ripple", "supply_voltage_ripple", "pressure_bump", "pressure_switch"),
+    C: ("rate_ripple",),
+}
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What was hidden; `effect` None for nothing, `driver` the columns an uncatalogued effect follows."""
+
+    effect: str | None
+    amplitude: float = 0.0
+    shape: dict[str, Any] = field(default_factory=dict)
+    driver: tuple[str, ...] | None = None
+    baseline: tuple[str, ...] = ()
+    bias: float = 0.0
+    scale_error: float = 0.0
+    error: Array = field(default_factory=lambda: np.zeros(0))
+    noise: Array = field(default_factory=lambda: np.zeros(0))
+
+
+def hide(
+    effect: str | None, design: Design, noise: Noise, times_mde: float, rng: np.random.Generator
+) -> tuple[dict[str, Array], dict[str, str], dict[str, str | int | float], Truth]:
+    """Simulate one campaign's output with `effect` hidden at `times_mde` times its minimal detectable size.
+
+    What the baseline model holds (bias, scale factor) has values of its own that the fit must find.
+    """
+    names = baseline(design, effect)
+    bias = np.deg2rad(rng.uniform(-20, 20) / 3600) if "bias" in names else 0.0
+    scale_error = rng.uniform(-1e-3, 1e-3) if "scale_factor" in names else 0.0
+    shape, size, wrong = {}, 0.0, np.zeros(len(design.index))
+    if effect is not None:
+        shape = draw_shape(effect, design, rng)
+        size = float(rng.choice([-1, 1])) * amplitude(effect, design, noise, shape, times_mde)
+        if effect == "scale_sagnac_sine":
+            size = abs(size)  # a phase has no second sign
+        wrong = error(effect, design, size, shape)
+    drawn = noise.sample(design, rng)
+    output = design.true["rate"] * (1 + scale_error) + (wrong + bias) * (1 + scale_error) + drawn
+    columns = design.columns | {"output": np.rad2deg(output)}
+    driver = UNKNOWN[effect][1] if effect in UNKNOWN else None
+    truth = Truth(effect, size, shape, driver, names, bias, scale_error, wrong, drawn)
+    return columns, design.units | {"output": "deg/s"}, dict(design.metadata), truth
+
+
+def known(effect: str | None) -> bool:
+    """Whether the catalogue has this effect."""
+    return effect in EFFECTS

@@ -1,0 +1,166 @@
+"""Who wins among named signals: the oracle that knows noise and size, and the controls that should fail.
+
+A library maps each name to an array (sample, shape, column): every shape is one candidate, its columns fitted together.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import gammaln, ive, logsumexp
+from scipy.stats import f as f_distribution
+
+from .campaigns import TESTABLE
+from .designs import Design
+from .effects import error
+from .mde import Oracle, baseline
+
+Array = np.ndarray
+Library = dict[str, Array]
+
+
+def library(design: Design, effect: str | None) -> Library:
+    """Signals of every catalogue effect the design can show and the baseline lacks, on grids of shapes."""
+    names = [n for n in TESTABLE[design.name] if n not in baseline(design, effect)]
+    return {name: _signals(name, design) for name in names}
+
+
+def _signals(name: str, design: Design) -> Array:
+    time = design.true["time"]
+    span = np.ptp(time)
+    shapes: list[dict[str, object]] = [{}]
+    match name:
+        case "scale_nonlinearity":
+            return np.stack([error(name, design, 1.0, {"mix": row}) for row in np.eye(4)], axis=-1)[:, None]
+        case "bias_periodic":
+            angle = 2 * np.pi * np.outer(time, np.arange(4 / span, 0.22 / design.step, 1 / (4 * span)))
+            return np.stack([np.sin(angle), np.cos(angle)], axis=-1)
+        case "bias_temperature_curve" | "scale_temperature_curve":
+            knots = np.percentile(design.true["temperature"], np.linspace(20, 80, 12))
+            shapes = [{"kind": kind, "at": at} for kind in ("parabola", "bend") for at in knots]
+        case "bias_temperature_rate":
+            shapes = [{"tau": 2.5 * design.step}]
+        case "bias_warmup":
+            shapes = [{"tau": tau * span} for tau in np.geomspace(0.04, 0.3, 12)]
+        case "bias_step":
+            shapes = [{"at": at} for at in 0.5 * (time[1:] + time[:-1])[len(time) // 12 : -(len(time) // 12)]]
+    size = 0.3 / np.abs(design.true["rate"]).max() if name == "scale_sagnac_sine" else 1.0
+    return np.stack([error(name, design, size, shape) for shape in shapes], axis=1)[:, :, None]
+
+
+def reduced(judge: Oracle, signals: Library) -> Library:
+    """Whitened, projected and, within each shape, orthonormalised signals."""
+    result = {}
+    for name, block in signals.items():
+        n, m, q = block.shape
+        flat = judge.reduce(block.reshape(n, m * q) / np.abs(block).max())
+        unit = flat.reshape(n, m, q)
+        for j in range(q):
+            for i in range(j):
+                unit[:, :, j] -= np.sum(unit[:, :, i] * unit[:, :, j], axis=0) * unit[:, :, i]
+            unit[:, :, j] /= np.linalg.norm(unit[:, :, j], axis=0)
+        result[name] = unit
+    return result
+
+
+def energies(unit: Library, residual: Array) -> dict[str, Array]:
+    """|U^T r|^2 of every shape."""
+    return {name: np.sum(np.tensordot(residual, u, 1) ** 2, axis=-1) for name, u in unit.items()}
+
+
+def oracle_first(unit: Library, residual: Array, size: float) -> str:
+    """Most probable name when noise and size (lambda) are known; direction and shape uniform on their grids."""
+    score = {}
+    for name, energy in energies(unit, residual).items():
+        order, x = unit[name].shape[2] / 2 - 1, size * np.sqrt(energy)
+        score[name] = float(
+            logsumexp(gammaln(order + 1) + order * np.log(2 / x) + np.log(ive(order, x)) + x, b=1 / len(x))
+        )
+    return max(score, key=score.__getitem__)
+
+
+def separation_needed(unit: Library, truth: str, signal: Array) -> dict[str, float]:
+    """lambda from which each rival is told from the true signal with 95 %: 1.645 sqrt(2/(1 - rho))."""
+    direction = signal / np.linalg.norm(signal)
+    rho = {name: np.sqrt(e.max()) for name, e in energies(unit, direction).items() if name != truth}
+    return {name: float(1.645 * np.sqrt(2 / max(1 - r, 1e-12))) for name, r in rho.items()}
+
+
+class Control(NamedTuple):
+    """What a control method answers: the names it adds, first one first."""
+
+    added: tuple[str, ...]
+    first: str
+
+
+def least_squares_f(unit: Library, residual: Array, parameters: int) -> Control:
+    """F test as if the noise were white, Bonferroni over every candidate and shape, 1 %."""
+    rss, tests = residual @ residual, sum(u.shape[1] for u in unit.values())
+    p = {}
+    for name, energy in energies(unit, residual).items():
+        q, best = unit[name].shape[2], energy.max()
+        nu = len(residual) - parameters - q
+        p[name] = f_distribution.logsf(best / q / ((rss - best) / nu), q, nu)
+    first = min(p, key=p.__getitem__)
+    return Control((first,) if p[first] < np.log(0.01 / tests) else (), first)
+
+
+def stepwise_bic(unit: Library, residual: Array, most: int = 4) -> Control:
+    """Forward selection while the Bayesian information criterion falls."""
+    n, added, first = len(residual), [], ""
+    for _ in range(most):
+        rss = residual @ residual
+        gain, name, where = -np.inf, "", 0
+        for candidate, energy in energies(unit, residual).items():
+            change = -n * np.log1p(-energy.max() / rss) - unit[candidate].shape[2] * np.log(n)
+            if change > gain:
+                gain, name, where = change, candidate, int(energy.argmax())
+        first = first or name
+        if gain <= 0:
+            break
+        added.append(name)
+        U = unit[name][:, where]
+        residual = residual - U @ (U.T @ residual)
+    return Control(tuple(dict.fromkeys(added)), first)
+
+
+def lasso(unit: Library, residual: Array, most_columns: int = 60) -> Control:
+    """Lasso on the columns that correlate best; penalty by five-fold cross-validation, one-standard-error rule."""
+    X, owner = [], []
+    for name, u in unit.items():
+        best = np.argsort(-energies({name: u}, residual)[name])[:8]
+        for m in best:
+            X += list(u[:, m].T)
+            owner += [name] * u.shape[2]
+    keep = np.argsort(-np.abs(np.array(X) @ residual))[:most_columns]
+    columns, owner = np.array(X)[keep].T, [owner[k] for k in keep]
+    path = np.abs(columns.T @ residual).max() * np.geomspace(1, 0.02, 25)
+    fold = np.arange(len(residual)) * 5 // len(residual)
+    loss = np.empty((5, len(path)))
+    for k in range(5):
+        train, test = fold != k, fold == k
+        for j, b in enumerate(_lasso_path(columns[train], residual[train], 0.8 * path)):
+            loss[k, j] = np.mean((residual[test] - columns[test] @ b) ** 2)
+    mean, error = loss.mean(0), loss.std(0, ddof=1) / np.sqrt(5)
+    chosen = int(np.argmax(mean <= mean.min() + error[mean.argmin()]))
+    *_, b = _lasso_path(columns, residual, path[: chosen + 1])
+    order = np.argsort(-np.abs(b))
+    added = tuple(dict.fromkeys(owner[i] for i in order if b[i] != 0))
+    return Control(added, added[0] if added else owner[0])
+
+
+def _lasso_path(X: Array, y: Array, penalties: Array) -> list[Array]:
+    """Accelerated proximal gradient, warm-started down the path."""
+    G, c = X.T @ X, X.T @ y
+    step = 1 / np.linalg.eigvalsh(G)[-1]
+    b, path = np.zeros(len(c)), []
+    for penalty in penalties:
+        ahead, t = b, 1.0
+        for _ in range(80):
+            z = ahead + step * (c - G @ ahead)
+            new = np.sign(z) * np.maximum(np.abs(z) - step * penalty, 0.0)
+            t_new = 0.5 * (1 + np.sqrt(1 + 4 * t * t))
+            b, ahead, t = new, new + (t - 1) / t_new * (new - b), t_new
+        path.append(b)
+    return path

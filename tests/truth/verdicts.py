@@ -1,0 +1,96 @@
+"""What counts as a right answer about a hidden effect.
+
+ACCEPTED lists every answer other than the effect's own name that is right, with the reason. Nothing else is accepted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from .campaigns import Truth, known
+
+
+@dataclass(frozen=True)
+class Accepted:
+    """`stand_ins` may be named firmly instead of the truth; `ambiguous` accepts an ambiguous set that holds it."""
+
+    truth: str
+    stand_ins: frozenset[str]
+    ambiguous: bool
+    reason: str
+    designs: tuple[str, ...] = ()  # empty: all
+
+
+_SLOW = "one run cannot tell a slow change of bias from random walk or flicker"
+ACCEPTED = (
+    Accepted("bias_drift", frozenset(), True, _SLOW),
+    Accepted("bias_step", frozenset(), True, _SLOW),
+    Accepted("bias_warmup", frozenset(), True, _SLOW),
+    Accepted("scale_sagnac_sine", frozenset({"scale_nonlinearity"}), True, "a sine equals a cubic to third order"),
+    Accepted("bias_temperature_rate", frozenset({"temperature_lag"}), True, "identical when bias(T) is a line"),
+    Accepted("bias_temperature", frozenset(), True, "temperature is a line in time on one ramp", ("static_ramp",)),
+)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What the engine said, as plain values."""
+
+    verdict: str
+    causes: tuple[str, ...]
+    first: str  # top of the first round's ranking, whatever the verdict
+    credible: tuple[str, ...]
+    driver: tuple[str, ...]
+    gain_ratio: tuple[float, float, float]  # value, low, high
+    gain_score: tuple[float, float, float]  # nats: value, low, high
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Score:
+    """One case judged."""
+
+    right: bool
+    detected: bool
+    named: bool  # firmly named, alone
+    firm_and_wrong: bool
+    in_set: bool
+    set_size: int
+    called_unknown: bool
+    first_right: bool
+    driver_right: bool
+    gain_claimed: bool
+
+
+def _allowed(truth: str, design: str) -> tuple[frozenset[str], bool]:
+    rows = [a for a in ACCEPTED if a.truth == truth and (not a.designs or design in a.designs)]
+    return frozenset({truth}).union(*(a.stand_ins for a in rows)), any(a.ambiguous for a in rows)
+
+
+def judge(truth: Truth, design: str, answer: Answer) -> Score:
+    """Judge an answer against what was hidden."""
+    detected, firm = answer.verdict != "adequate", answer.verdict == "named"
+    names = frozenset(answer.causes)
+    members = names | frozenset(answer.credible)
+    driver_right = answer.verdict == "unknown" and set(answer.driver) == set(truth.driver or ())
+    if truth.effect is None:
+        allowed, right = frozenset(), not detected
+    elif not known(truth.effect):
+        allowed, right = frozenset(), driver_right
+    else:
+        allowed, tolerant = _allowed(truth.effect, design)
+        right = (firm and len(names) == 1 and names <= allowed) or (
+            tolerant and answer.verdict == "ambiguous" and truth.effect in members
+        )
+    return Score(
+        right=right,
+        detected=detected,
+        named=firm and len(names) == 1 and names <= allowed,
+        firm_and_wrong=firm and not names <= allowed,
+        in_set=bool(allowed & members),
+        set_size=max(len(answer.credible), 1),
+        called_unknown=answer.verdict == "unknown",
+        first_right=answer.first in allowed,
+        driver_right=driver_right,
+        gain_claimed=answer.gain_score[1] > 0,
+    )
