@@ -20,7 +20,7 @@ types: $(READY)
 	$(BIN)/pyright
 
 bench: $(READY)
-	$(BIN)/python -m benchmarks
+	for study in benchmarks/[!_]*.py; do $(BIN)/python -m benchmarks.$$(basename $$study .py) || exit 1; done
 
 clean:
 	rm -rf .venv .cache build dist gyromodel-demo

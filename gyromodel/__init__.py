@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from gyromodel.campaign import Campaign as Campaign
     from gyromodel.campaign import CampaignError as CampaignError
-    from gyromodel.diagnose import Diagnosis as Diagnosis
-    from gyromodel.diagnose import diagnose as diagnose
+    from gyromodel.diagnosis import Diagnosis as Diagnosis
+    from gyromodel.diagnosis import diagnose as diagnose
     from gyromodel.effects import CATALOGUE as CATALOGUE
     from gyromodel.effects import Effect as Effect
     from gyromodel.estimate import Estimate as Estimate
@@ -35,12 +35,12 @@ _MODULE_OF = {
     "CATALOGUE": "effects",
     "Campaign": "campaign",
     "CampaignError": "campaign",
-    "Diagnosis": "diagnose",
+    "Diagnosis": "diagnosis",
     "Effect": "effects",
     "Estimate": "estimate",
     "GyroModel": "model",
     "UnitError": "units",
-    "diagnose": "diagnose",
+    "diagnose": "diagnosis",
     "fit": "estimate",
     "model_from_effects": "model",
     "read_campaign": "files",

@@ -64,7 +64,7 @@ def _read_csv_head(stream: io.BufferedIOBase) -> tuple[dict[str, Any], dict[str,
         try:
             text = line.decode("utf-8-sig" if number == 1 else "utf-8").strip()
         except UnicodeDecodeError as error:
-            raise CampaignError(f"line {number} is not UTF-8 text: {shown(repr(line[error.start :][:8]))}") from error
+            raise CampaignError(f"line {number} is not UTF-8 text: {line[error.start :][:8]!r}") from error
         if not text.startswith("#"):
             if text:
                 return metadata, read_headers(_split(text, number))

@@ -229,18 +229,17 @@ def check_unit(name: str, unit: str | None) -> str:
     if not _COLUMN_NAME.fullmatch(name) or len(name.encode()) > 200:
         rule = 'it must start with a letter or digit, have at most 200 bytes and none of [ ] , ; " / \\'
         raise CampaignError(f"{shown(name)} cannot name a column: {rule}")
+    known = next(((meaning, examples) for pattern, meaning, examples in _EXPECTED if pattern.fullmatch(name)), None)
     if unit is None:
-        raise CampaignError(
-            f"column '{name}' has no unit: write '{name} [unit]', or '{name} []' for a plain number "
-            f"(accepted: {unit_system.ACCEPTED})"
-        )
+        accepted = f"{known[0]}: {_listed(known[1])}" if known else unit_system.ACCEPTED
+        example = known[1][0] if known else "unit"
+        raise CampaignError(f"column '{name}' has no unit: write '{name} [{example}]' (accepted: {accepted})")
     try:
         unit = unit_system.tidy(unit)
     except unit_system.UnitError as error:
         raise CampaignError(f"column '{name}': {error}") from error
-    for pattern, meaning, examples in _EXPECTED:
-        if pattern.fullmatch(name) and not any(unit_system.convertible(unit, example) for example in examples):
-            raise CampaignError(f"column '{name}' has unit [{unit}], expected {meaning}, such as {_listed(examples)}")
+    if known and not any(unit_system.convertible(unit, example) for example in known[1]):
+        raise CampaignError(f"column '{name}' has unit [{unit}], expected {known[0]}, such as {_listed(known[1])}")
     return unit
 
 
@@ -359,7 +358,7 @@ def _kind_advice(campaign: Campaign) -> str:
     if len(kinds) < len(KINDS):
         seen += f"; its unit [{unit}] allows {' or '.join(kinds)} only"
     lines = " or ".join(f"'# kind: {kind}'" for kind in likely)
-    return f"metadata 'kind' is missing and not assumed: {seen}; add the line {lines} (or, not in CSV, the attribute)"
+    return f"metadata 'kind' is missing and not assumed: {seen}; add the line {lines} (or set the attribute)"
 
 
 def short_time_slope(values: np.ndarray) -> float | None:

@@ -19,7 +19,7 @@ from gyromodel._atomic import write_text
 
 if TYPE_CHECKING:
     from gyromodel.campaign import Campaign
-    from gyromodel.diagnose import Diagnosis
+    from gyromodel.diagnosis import Diagnosis
 
 DATA = Path(__file__).parent / "data"
 REPORTS = ("report.html", "diagnosis.json", "model.yaml")
@@ -245,7 +245,7 @@ def _diagnose(
 ) -> tuple[dict[str, Any], str]:
     """Diagnose and write the results; what diagnosis.json holds, and the verdict in a sentence."""
     _prepare(output, model)
-    from gyromodel.diagnose import diagnose as diagnose_campaigns
+    from gyromodel.diagnosis import diagnose as diagnose_campaigns
     from gyromodel.model_files import read_model, write_model
     from gyromodel.report import sentence, write_report
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gzip
 import math
+import mmap
 import os
 import secrets
 import shutil
@@ -117,7 +118,7 @@ def _damage(form: str) -> Iterator[None]:
         raise
     except Exception as error:  # HDF5, Zarr and Arrow raise nearly every type when bytes are wrong
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise CampaignError(f"is no {form} file, or is cut short or damaged ({shown(reason)})") from error
+        raise CampaignError(f"is no {form} file, or is cut short or damaged ({reason[:200]})") from error
 
 
 def _read_csv(path: Path) -> Contents:
@@ -179,8 +180,8 @@ def _read_netcdf(path: Path) -> Contents:
     import h5py
 
     with _damage("NetCDF-4"):
-        _check_heaps(path)
         with h5py.File(path, "r") as file:
+            _check_heaps(path)
             dict(file.attrs)  # h5netcdf prints a traceback where these are damaged, h5py raises
         return _read_dataset(path, engine="h5netcdf")
 
@@ -190,19 +191,20 @@ def _check_heaps(path: Path) -> None:
 
     Source: HDF5 File Format Specification, III.E, disk format of the global heap.
     """
-    data = path.read_bytes()
-    start = -1
-    while (start := data.find(b"GCOL\x01\0\0\0", start + 1)) >= 0:
-        end = start + int.from_bytes(data[start + 8 : start + 16], "little")
-        at = start + 16
-        while at + 16 <= end:
-            index, length = int.from_bytes(data[at : at + 2], "little"), int.from_bytes(data[at + 8 : at + 16], "little")
-            # Object 0 is the free space, to the end and with its own header; the others are padded to 8 bytes.
-            at += length if index == 0 else 16 + -(-length // 8) * 8
-            if index == 0:
-                break
-        if at > end or end > len(data) or (at != end and at + 16 <= end):
-            raise CampaignError("is damaged: a block of texts in it does not add up")
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        start = -1
+        while (start := data.find(b"GCOL\x01\0\0\0", start + 1)) >= 0:
+            end = start + int.from_bytes(data[start + 8 : start + 16], "little")
+            index, at = 1, start + 16
+            while index and at + 16 <= end:
+                index, length = (
+                    int.from_bytes(data[at : at + 2], "little"),
+                    int.from_bytes(data[at + 8 : at + 16], "little"),
+                )
+                # Object 0 is the free space, its header counted; the others have theirs besides, padded to 8 bytes.
+                at += 16 + -(-length // 8) * 8 if index else length
+            if end > len(data) or at > end or (index == 0 and at != end):
+                raise CampaignError("is damaged: a block of texts in it does not add up")
 
 
 def _read_zarr(path: Path) -> Contents:

@@ -16,7 +16,7 @@ from gyromodel.effects import CATALOGUE, Effect, Signals
 from gyromodel.effects._base import evaluate
 from gyromodel.effects.drivers import BiasColumn
 from gyromodel.noise import NoiseRatios, markov_sum
-from gyromodel.numerics.state_space import unwhiten
+from gyromodel.numerics.state_space import build_filter, colour
 from gyromodel.signals import Record, read_signals
 from gyromodel.units import from_internal
 
@@ -236,7 +236,8 @@ def draw_noise(model: GyroModel, record: Record, rng: np.random.Generator) -> np
     )
     draws = jnp.asarray(rng.standard_normal(len(record.sampling.present)))
     sampling = record.sampling._replace(present=jnp.ones_like(record.sampling.present))
-    noise = unwhiten(markov_sum(ratios, record.interval, record_span(record)), sampling, draws)
+    filter = build_filter(markov_sum(ratios, record.interval, record_span(record)), sampling)
+    noise = colour(filter, draws)
     return np.asarray(noise)[: record.rows] * np.sqrt(variance) * abs(float(model.gain()))
 
 
@@ -244,4 +245,3 @@ def record_span(record: Record) -> float:
     """Time from first to last sample (s), at least two intervals."""
     time = np.asarray(record.signals["time"])[: record.rows]
     return float(max(np.max(time) - np.min(time), 2 * record.interval))
-

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import yaml
 
+from gyromodel import __version__
 from gyromodel._atomic import write_text
 from gyromodel.effects import Effect
 from gyromodel.effects.drivers import BiasColumn
@@ -64,8 +64,10 @@ class _Place:
                 raise self.error(f"{text!r} needs a unit, for example {text} {unit}")
             if not convertible(written, unit):
                 raise self.error(f"{text!r} is not a quantity in {unit}")
-            return float(to_internal(np.asarray(value), written)) if unit == "degC" else value * factor(
-                written, internal_unit(unit)
+            return (
+                float(to_internal(np.asarray(value), written))
+                if unit == "degC"
+                else value * factor(written, internal_unit(unit))
             )
         except UnitError as problem:
             raise self.error(str(problem)) from None
@@ -203,7 +205,9 @@ def write_model(model: GyroModel | Estimate, path: str | Path) -> None:
     """Write a model; of an estimate also uncertainties, covariance, validity, data hash and software version."""
     estimate = model if isinstance(model, Estimate) else None
     gyro_model = model.model if isinstance(model, Estimate) else model
-    write_text(Path(path), yaml.safe_dump(_document(gyro_model, estimate), sort_keys=False, allow_unicode=True, width=110))
+    write_text(
+        Path(path), yaml.safe_dump(_document(gyro_model, estimate), sort_keys=False, allow_unicode=True, width=110)
+    )
 
 
 def _document(model: GyroModel, estimate: Estimate | None) -> dict[str, Any]:
@@ -216,7 +220,9 @@ def _document(model: GyroModel, estimate: Estimate | None) -> dict[str, Any]:
     for i, effect in enumerate(model.effects):
         entry: dict[str, Any] = {"effect": effect.label}
         for name in effect.declared():
-            unit = parameter_unit(effect, name, record.output_unit if record else "rad/s", record.units if record else {})
+            unit = parameter_unit(
+                effect, name, record.output_unit if record else "rad/s", record.units if record else {}
+            )
             values = np.asarray(getattr(effect, name))
             if not np.isfinite(values).all():
                 continue
@@ -243,12 +249,17 @@ def _document(model: GyroModel, estimate: Estimate | None) -> dict[str, Any]:
         document["noise"] = "auto"
     else:
         document["noise"] = [
-            {"effect": k, "value": _quantity_text(float(v) * factor(internal_unit(NOISE_UNITS[k]), NOISE_UNITS[k]), NOISE_UNITS[k])}
+            {
+                "effect": k,
+                "value": _quantity_text(
+                    float(v) * factor(internal_unit(NOISE_UNITS[k]), NOISE_UNITS[k]), NOISE_UNITS[k]
+                ),
+            }
             for k, v in model.noise.items()
         ]
     if estimate and record:
         document["fit"] = _fit_record(estimate)
-        document["software"] = f"gyromodel {version('gyromodel')}"
+        document["software"] = f"gyromodel {__version__}"
     return document
 
 
@@ -282,6 +293,3 @@ def _setting_text(effect: Effect, name: str, value: float, record: Any) -> str:
 
 def _quantity_text(value: float, unit: str) -> str:
     return f"{value:.17g}" if unit in ("", "1") else f"{value:.17g} {unit}"
-
-
-

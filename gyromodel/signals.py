@@ -104,7 +104,9 @@ def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
     for other in campaigns[1:]:
         missing = set(names) ^ {n for n in other.columns if not n.startswith("output")}
         if missing:
-            raise CampaignError(f"{other.name}: campaigns fitted together need the same columns; {min(missing)} is in only some")
+            raise CampaignError(
+                f"{other.name}: campaigns fitted together need the same columns; {min(missing)} is in only some"
+            )
     parts: dict[str, list[np.ndarray]] = {}
     blocks, schemes, unit = [], set(), ""
     for campaign in campaigns:
@@ -119,7 +121,10 @@ def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
         if "temperature" in columns:
             stretch = _stretches(time)
             columns["temperature_rate"] = np.concatenate(
-                [_thermometer_rate(time[stretch == s], columns["temperature"][stretch == s]) for s in np.unique(stretch)]
+                [
+                    _thermometer_rate(time[stretch == s], columns["temperature"][stretch == s])
+                    for s in np.unique(stretch)
+                ]
             )
         columns["output"] = output
         step = np.diff(time, prepend=time[0])
@@ -144,9 +149,7 @@ def _thermometer_rate(time: np.ndarray, temperature: np.ndarray) -> np.ndarray:
     return rate
 
 
-def _pad(
-    columns: dict[str, np.ndarray], blocks: np.ndarray, scheme: str, unit: str, units: dict[str, str]
-) -> Record:
+def _pad(columns: dict[str, np.ndarray], blocks: np.ndarray, scheme: str, unit: str, units: dict[str, str]) -> Record:
     rows = len(blocks)
     extra = padded_length(rows) - rows
     interval, restart, output = columns.pop("_interval"), columns.pop("_restart"), columns["output"]

@@ -23,7 +23,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gyromodel.campaign import Campaign
-from gyromodel.diagnose._result import Candidate, Cause, Confuser, Diagnosis, Driver, Gain, ParameterValue, Round
+from gyromodel.diagnosis._result import Candidate, Cause, Confuser, Diagnosis, Driver, Gain, ParameterValue, Round
 from gyromodel.estimate import Estimate
 from gyromodel.estimate._estimate import ParameterRow
 from gyromodel.report import sentence, with_uncertainty, write_report

@@ -141,7 +141,9 @@ def evaluate(
         value = getattr(effect, name)
 
         def moved(v, name=name):
-            return eqx.tree_at(lambda e: getattr(e, name), effect, jnp.reshape(v, jnp.shape(value))).contribution(signals)
+            return eqx.tree_at(lambda e: getattr(e, name), effect, jnp.reshape(v, jnp.shape(value))).contribution(
+                signals
+            )
 
         for direction in jnp.eye(jnp.size(value)):
             derivatives.append(jax.jvp(moved, (jnp.ravel(value),), (direction,))[1])

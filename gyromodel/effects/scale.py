@@ -6,6 +6,7 @@ import itertools
 from typing import Self
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -204,12 +205,22 @@ class ScaleSpline(Effect):
             self.coefficients = jnp.zeros(self.knots - 2)
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
-        """Truncated cubes that are straight outside the outer knots; knots are even from `lowest` to `full_rate`."""
+        """Truncated cubes that are straight outside the outer knots, less their tangent at rest.
+
+        Knots are even from `lowest` to `full_rate`; with value and slope zero at rest, bias and scale factor keep their meaning.
+        """
         places = jnp.linspace(0.0, 1.0, self.knots)
-        u = (signals["rate"] - self.lowest) / (self.full_rate - self.lowest)
-        cube = jnp.maximum(u[:, None] - places, 0.0) ** 3
-        part = (cube[:, :-1] - cube[:, -1:]) / (1.0 - places[:-1])
-        return (part[:, :-1] - part[:, -1:]) * self.full_rate
+        width = self.full_rate - self.lowest
+
+        def bends(u):
+            cube = jnp.maximum(u[..., None] - places, 0.0) ** 3
+            part = (cube[..., :-1] - cube[..., -1:]) / (1.0 - places[:-1])
+            return part[..., :-1] - part[..., -1:]
+
+        rest = -self.lowest / width
+        value, slope = jax.jvp(bends, (rest,), (jnp.ones(()),))
+        rate = signals["rate"]
+        return (bends((rate - self.lowest) / width) - value - slope * rate[:, None] / width) * self.full_rate
 
     def prepared(self, signals: Signals) -> Self:
         """Spread the knots over the campaign's rates."""

@@ -46,6 +46,7 @@ class Estimate:
         noise_interval: 95 % interval of each noise coefficient, internal rate units.
         log_likelihood: restricted, at the estimate.
         noise_given: whether the model stated its noise.
+        ordinary: whether the parameters weigh all samples alike (see `fit_record`).
     """
 
     model: GyroModel
@@ -60,12 +61,17 @@ class Estimate:
     iterations: int
     record: Record = field(repr=False)
     noise_given: bool = False
+    ordinary: bool = False
     noise_interval: Mapping[str, tuple[float, float]] = field(default_factory=dict, repr=False)
 
     @property
     def std(self) -> np.ndarray:
         """Standard uncertainties, in the order of `model.slots()`, internal units."""
         return np.sqrt(np.diag(self.covariance))
+
+    def model_as_given(self) -> GyroModel:
+        """The fitted model with its noise to be estimated again, unless it was stated."""
+        return self.model if self.noise_given else GyroModel(self.model.effects, {}, self.model.fixed, self.model.gyro)
 
     def table(self) -> tuple[ParameterRow, ...]:
         """Every parameter in its reporting unit; those held fixed have standard uncertainty zero."""
@@ -78,7 +84,9 @@ class Estimate:
                 values = np.ravel(getattr(effect, name))
                 for j, value in enumerate(values):
                     shown = name if len(values) == 1 else f"{name}[{j}]"
-                    rows.append(ParameterRow(effect.label, shown, value * scale, spread.get((i, name, j), 0.0) * scale, unit))
+                    rows.append(
+                        ParameterRow(effect.label, shown, value * scale, spread.get((i, name, j), 0.0) * scale, unit)
+                    )
         return tuple(rows)
 
     def noise_table(self) -> dict[str, dict[str, float | str]]:

@@ -15,7 +15,7 @@ from gyromodel.estimate._optimistix import optimistix_solution
 from gyromodel.model import GyroModel, ModelError, record_span
 from gyromodel.noise import NoiseRatios, markov_sum, noise_grid, restricted_likelihood
 from gyromodel.numerics.least_squares import Normal, Solution, levenberg_marquardt
-from gyromodel.numerics.state_space import Filter, build_filter, whiten
+from gyromodel.numerics.state_space import Filter, build_filter, colour, whiten
 from gyromodel.signals import Record, read_signals
 
 Solver = Literal["levenberg_marquardt", "optimistix"]
@@ -60,8 +60,19 @@ def fit_record(
     ratios: NoiseRatios | None = None,
     solver: Solver = "levenberg_marquardt",
     intervals: bool = False,
+    ordinary: bool = False,
 ) -> Estimate:
-    """As `fit`, on signals already read; `ratios` holds the noise ratios fixed."""
+    """As `fit`, on signals already read.
+
+    Args:
+        record: the data.
+        model: what to fit.
+        ratios: noise ratios to hold instead of estimating them.
+        solver: see `fit`.
+        intervals: whether to find the noise coefficients' intervals.
+        ordinary: weigh all samples alike in the parameters (the noise is still estimated, and so is the covariance that
+            ordinary least squares has under it): less efficient where the noise model is right, and safer where it is not.
+    """
     if not jnp.zeros(()).dtype == jnp.float64:
         raise EstimateError("JAX runs in single precision; import gyromodel before using jax, or set JAX_ENABLE_X64=1")
     model = model.prepared(record.signals)
@@ -86,7 +97,10 @@ def fit_record(
     assert solution is not None
     if given is None:
         solution = solve(model, x, record, now, solver)
-    return _finish(record, model.with_vector(jnp.asarray(solution.x)), now, solution, intervals)
+    if ordinary:
+        white = NoiseRatios(jnp.zeros(()), jnp.zeros(()))
+        solution = solve(model, solution.x, record, white, solver)
+    return _finish(record, model.with_vector(jnp.asarray(solution.x)), now, solution, intervals, ordinary)
 
 
 def check_covariates(record: Record, model: GyroModel) -> None:
@@ -190,14 +204,20 @@ def _close(a: NoiseRatios, b: NoiseRatios) -> bool:
     return all(abs(np.log((float(x) + 1e-300) / (float(y) + 1e-300))) < 0.05 for x, y in zip(a, b, strict=True))
 
 
-def _finish(record: Record, model: GyroModel, ratios: NoiseRatios, solution: Solution, intervals: bool) -> Estimate:
+def _finish(
+    record: Record, model: GyroModel, ratios: NoiseRatios, solution: Solution, intervals: bool, ordinary: bool
+) -> Estimate:
     predicted, jacobian = model.linearise(record.signals)
     output, present = record.signals["output"], record.sampling.present
     residual = jnp.where(present, output - predicted, 0.0)
     filter = filter_of(record, ratios)
     p = jacobian.shape[1]
-    w = np.asarray(whiten_columns(filter, pad_columns(jnp.column_stack([jacobian, residual]))))[np.asarray(present), : p + 1]
+    w = np.asarray(whiten_columns(filter, pad_columns(jnp.column_stack([jacobian, residual]))))[
+        np.asarray(present), : p + 1
+    ]
     covariance = unit_covariance(w[:, :p], model)
+    if ordinary:
+        covariance = _ordinary_covariance(record, ratios, jacobian, model)
     nu = len(w) - p
     variance = float(w[:, p] @ w[:, p]) / nu
     args = (record.interval, record_span(record), record.sampling, jacobian, residual)
@@ -222,6 +242,7 @@ def _finish(record: Record, model: GyroModel, ratios: NoiseRatios, solution: Sol
         iterations=int(solution.iterations),
         record=record,
         noise_given=bool(model.noise),
+        ordinary=ordinary,
         noise_interval=spans,
     )
 
@@ -235,7 +256,9 @@ def unit_covariance(whitened_jacobian: np.ndarray, model: GyroModel) -> np.ndarr
     norm = np.linalg.norm(whitened_jacobian, axis=0)
     if (norm == 0).any():
         silent = sorted({model.labels[slots[i].effect] for i in np.flatnonzero(norm == 0)})
-        raise EstimateError(f"{', '.join(silent)} cannot be estimated: this campaign does not excite it; remove it or fix it")
+        raise EstimateError(
+            f"{', '.join(silent)} cannot be estimated: this campaign does not excite it; remove it or fix it"
+        )
     r = np.linalg.qr(whitened_jacobian / norm, mode="r")
     _, singular, directions = np.linalg.svd(r)
     weak = directions[singular < SINGULAR * singular[0]]
@@ -246,6 +269,23 @@ def unit_covariance(whitened_jacobian: np.ndarray, model: GyroModel) -> np.ndarr
         )
     inverse = np.linalg.inv(r)
     return (inverse @ inverse.T) / np.outer(norm, norm)
+
+
+def _ordinary_covariance(record: Record, ratios: NoiseRatios, jacobian, model: GyroModel) -> np.ndarray:
+    """(JᵀWJ)⁻¹ JᵀWVWJ (JᵀWJ)⁻¹ for weights W = 1/white, in units of the white variance."""
+    weighted = jnp.where(record.sampling.present[:, None], jacobian / record.sampling.white[:, None], 0.0)
+    root = jnp.where(record.sampling.present[:, None], jacobian / jnp.sqrt(record.sampling.white)[:, None], 0.0)
+    bread = unit_covariance(np.asarray(root), model)
+    meat = np.asarray(_coloured_transposed(filter_of(record, ratios), weighted))
+    return bread @ (meat.T @ meat) @ bread
+
+
+@jax.jit
+def _coloured_transposed(filter: Filter, columns):
+    """Lᵀ applied to columns."""
+    rows = columns.shape[0]
+    transposed = jax.linear_transpose(lambda draws: colour(filter, draws), jnp.zeros(rows))
+    return jax.vmap(lambda c: transposed(c)[0], in_axes=1, out_axes=1)(columns)
 
 
 def _noise_intervals(args, ratios: NoiseRatios, record: Record, gain: float) -> dict[str, tuple[float, float]]:

@@ -29,6 +29,8 @@ def _solve(model: GyroModel, x, signals, filter: Filter):
     norm = jnp.linalg.norm(jacobian, axis=0)
     scale = 1.0 / jnp.where(norm > 0, norm, 1.0)
     solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-10, linear_solver=lx.SVD())
-    found = optx.least_squares(lambda u, _: whitened(x + scale * u), solver, jnp.zeros_like(x), max_steps=256, throw=False)
+    found = optx.least_squares(
+        lambda u, _: whitened(x + scale * u), solver, jnp.zeros_like(x), max_steps=256, throw=False
+    )
     best = x + scale * found.value
     return best, jnp.sum(whitened(best) ** 2), found.stats["num_steps"], found.result == optx.RESULTS.successful

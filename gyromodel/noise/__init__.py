@@ -3,4 +3,13 @@
 from gyromodel.noise._model import NOISE_UNITS, NoiseGrid, NoiseRatios, coefficients, markov_sum, noise_grid
 from gyromodel.noise._likelihood import CellFit, restricted_likelihood
 
-__all__ = ["NOISE_UNITS", "CellFit", "NoiseGrid", "NoiseRatios", "coefficients", "markov_sum", "noise_grid", "restricted_likelihood"]
+__all__ = [
+    "NOISE_UNITS",
+    "CellFit",
+    "NoiseGrid",
+    "NoiseRatios",
+    "coefficients",
+    "markov_sum",
+    "noise_grid",
+    "restricted_likelihood",
+]

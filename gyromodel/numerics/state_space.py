@@ -83,15 +83,15 @@ def whiten(filter: Filter, columns: Float[Array, "sample column"]) -> Float[Arra
     return jax.lax.scan(step, start, (*filter, rows))[1]
 
 
-def unwhiten(noise: MarkovSum, sampling: Sampling, draws: Float[Array, " sample"]) -> Float[Array, " sample"]:
-    """L applied to independent unit normal draws: one realisation of the noise."""
-    filter = build_filter(noise, sampling)
+def colour(filter: Filter, draws: Float[Array, " sample"]) -> Float[Array, " sample"]:
+    """L applied to one column: of independent unit normal draws it makes one realisation of the noise."""
 
     def step(state, inputs):
-        transition, gain, scale, _, draw = inputs
+        transition, gain, scale, present, draw = inputs
+        innovation = scale * draw
         state = transition * state
-        value = state.sum() + scale * draw
-        return state + gain * scale * draw, value
+        value = jnp.where(present, state.sum() + innovation, 0.0)
+        return state + gain * innovation, value
 
     return jax.lax.scan(step, jnp.zeros(filter.gain.shape[1]), (*filter, draws))[1]
 

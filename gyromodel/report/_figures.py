@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from gyromodel.diagnose._result import Diagnosis
+    from gyromodel.diagnosis._result import Diagnosis
 
 _LABELLED = 6
 _MEASURED = "measured − model"

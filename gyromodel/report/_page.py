@@ -16,7 +16,7 @@ from gyromodel.report._sentence import confused, kinds, sentence
 from gyromodel.report._words import driver_name, listed, phrase, spoken, title
 
 if TYPE_CHECKING:
-    from gyromodel.diagnose._result import Cause, Diagnosis, Round
+    from gyromodel.diagnosis._result import Cause, Diagnosis, Round
 
 _BADGES = {
     "adequate": "Nothing missing",

@@ -10,7 +10,7 @@ from gyromodel.report._numbers import number, pair, unit_text, with_uncertainty
 from gyromodel.report._words import driver_name, listed, phrase, spoken
 
 if TYPE_CHECKING:
-    from gyromodel.diagnose._result import Cause, Diagnosis
+    from gyromodel.diagnosis._result import Cause, Diagnosis
 
 
 def sentence(diagnosis: Diagnosis) -> str:

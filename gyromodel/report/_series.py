@@ -13,7 +13,7 @@ from gyromodel.report._words import spoken
 
 if TYPE_CHECKING:
     from gyromodel.campaign import Campaign
-    from gyromodel.diagnose._result import Diagnosis
+    from gyromodel.diagnosis._result import Diagnosis
 
 POINTS = 3000
 PANELS = 10

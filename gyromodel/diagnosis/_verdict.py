@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from gyromodel.diagnose._bank import smooth_columns
-from gyromodel.diagnose._evidence import explained_for
-from gyromodel.diagnose._result import Cause, Confuser, Driver, ParameterValue, Verdict
-from gyromodel.diagnose._scan import Scanner
-from gyromodel.diagnose._search import Found, Ranking, Selection, form_effect, is_driver, leave_one_out
+from gyromodel.diagnosis._bank import smooth_columns
+from gyromodel.diagnosis._evidence import explained_for
+from gyromodel.diagnosis._result import Cause, Confuser, Driver, ParameterValue, Verdict
+from gyromodel.diagnosis._scan import Scanner
+from gyromodel.diagnosis._search import Found, Ranking, Selection, form_effect, is_driver, leave_one_out
 from gyromodel.effects import Effect
 from gyromodel.estimate import Estimate
 from gyromodel.model import effect_class, parameter_unit
@@ -83,7 +83,9 @@ def judge(
     runs = int(np.asarray(record.sampling.restart).sum())
     causes, sets, findings = [], [], []
     for i, step in enumerate(found):
-        ranking = step.ranking if len(found) == 1 else leave_one_out(record, scanner, baseline, found, i) or step.ranking
+        ranking = (
+            step.ranking if len(found) == 1 else leave_one_out(record, scanner, baseline, found, i) or step.ranking
+        )
         name = step.name
         statistic = ranking.statistic.get(name, step.ranking.statistic[name])
         members = credible(ranking, name, statistic, runs=runs)
@@ -109,19 +111,37 @@ def judge(
     if len(sets[0]) > 1:
         names = list(sets[0])
         return Judgement(
-            "ambiguous", _as_set(causes[0], sets[0]), sets[0], None, _next_test(names, record, causes[0]), unexplained, tuple(findings)
+            "ambiguous",
+            _as_set(causes[0], sets[0]),
+            sets[0],
+            None,
+            _next_test(names, record, causes[0]),
+            unexplained,
+            tuple(findings),
         )
     named = tuple(c for c, s in zip(causes, sets, strict=True) if len(s) == 1)
     for cause, members in zip(causes, sets, strict=True):
         if len(members) > 1:
             others = " or ".join(members)
-            findings.append(f"The extended model also holds {cause.effect}, which this campaign cannot tell from the others of: {others}.")
+            findings.append(
+                f"The extended model also holds {cause.effect}, which this campaign cannot tell from the others of: {others}."
+            )
     return Judgement("named", named, sets[0], None, None, unexplained, tuple(findings))
 
 
 def _as_set(cause: Cause, members: dict[str, float]) -> tuple[Cause, ...]:
-    others = [Cause(k, (), cause.statistic + np.log(v / members[cause.effect]) if cause.effect in members else cause.statistic,
-                    cause.p_value, cause.p_adjusted, v) for k, v in members.items() if k != cause.effect]
+    others = [
+        Cause(
+            k,
+            (),
+            cause.statistic + np.log(v / members[cause.effect]) if cause.effect in members else cause.statistic,
+            cause.p_value,
+            cause.p_adjusted,
+            v,
+        )
+        for k, v in members.items()
+        if k != cause.effect
+    ]
     return (cause, *others)
 
 
@@ -176,7 +196,9 @@ def _cause(
             confusers = (Confuser("scale_spline", 0.0), *confusers)
     else:
         parameters = tuple(
-            ParameterValue(r.name, r.value, r.std, r.unit) for r in estimate.table() if r.effect == name and r.std > 0 or r.effect == name
+            ParameterValue(r.name, r.value, r.std, r.unit)
+            for r in estimate.table()
+            if r.effect == name and r.std > 0 or r.effect == name
         )
     return Cause(name, parameters, statistic, p, adjusted, members.get(name, 0.0), confusers, tuple(step.rows))
 

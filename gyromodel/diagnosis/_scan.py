@@ -17,8 +17,8 @@ import numpy as np
 import scipy.fft
 from scipy.special import gammaln, logsumexp
 
-from gyromodel.diagnose._bank import Bank
-from gyromodel.diagnose._evidence import log_evidence_ratio, log_mean
+from gyromodel.diagnosis._bank import Bank
+from gyromodel.diagnosis._evidence import log_evidence_ratio, log_mean
 from gyromodel.estimate import make_filter, whiten_columns
 from gyromodel.model import record_span
 from gyromodel.noise import NoiseGrid, NoiseRatios
@@ -113,9 +113,16 @@ class Scanner:
         raw = np.concatenate([bank.columns, extra], axis=1)
         self._raw = jnp.asarray(np.pad(raw, ((0, 0), (0, -raw.shape[1] % COLUMN_STEP))))
         widths = [b.width for b in bank.blocks]
-        self._layout = {q: (widths.index(q), widths.count(q), bank.blocks[widths.index(q)].start) for q in sorted(set(widths))}
+        self._layout = {
+            q: (widths.index(q), widths.count(q), bank.blocks[widths.index(q)].start) for q in sorted(set(widths))
+        }
         names = [b.name for b in bank.blocks]
-        self._members = {name: np.flatnonzero(np.array(names) == name) for name in dict.fromkeys(names)}
+        structures = np.array([b.structure for b in bank.blocks])
+        self._members = {
+            name: [np.flatnonzero(structures == s) for s in dict.fromkeys(structures[np.array(names) == name])]
+            for name in dict.fromkeys(names)
+        }
+        self._widths = np.array([b.width for b in bank.blocks], int)
         self._positive = np.array([b.effect is not None and b.effect.positive for b in bank.blocks])
         self.epochs = np.flatnonzero(self.present[: record.rows])[1:-1]
 
@@ -135,7 +142,11 @@ class Scanner:
     def neighbours(self, cells: set[int]) -> list[int]:
         """These cells and those one level away."""
         flicker, walk = self._levels()
-        return [g for g in self.all_cells() if any(abs(flicker[g] - flicker[c]) <= 1 and abs(walk[g] - walk[c]) <= 1 for c in cells)]
+        return [
+            g
+            for g in self.all_cells()
+            if any(abs(flicker[g] - flicker[c]) <= 1 and abs(walk[g] - walk[c]) <= 1 for c in cells)
+        ]
 
     def _prepare(self, g: int) -> Cell:
         ratios = NoiseRatios(self.grid.ratios.flicker[g], self.grid.ratios.walk[g])
@@ -163,8 +174,20 @@ class Scanner:
         padded = jnp.pad(columns, ((0, 0), (0, -columns.shape[1] % COLUMN_STEP)))
         return np.asarray(whiten_columns(self.cell(g).filter, padded))[:, : columns.shape[1]]
 
-    def run(self, cells: Sequence[int], jacobian: np.ndarray, residual: np.ndarray) -> dict[int, CellResult]:
-        """Evaluate every candidate against a baseline in the given noise cells."""
+    def run(
+        self, cells: Sequence[int], jacobian: np.ndarray, residual: np.ndarray, contained: dict[str, int]
+    ) -> dict[int, CellResult]:
+        """Evaluate every candidate against a baseline in the given noise cells.
+
+        Args:
+            cells: which.
+            jacobian: the baseline's columns, any scale.
+            residual: measured minus predicted, as a rate.
+            contained: how many of a candidate's columns the baseline already has, by name.
+        """
+        spare = np.array([contained.get(b.name, 0) for b in self.bank.blocks])
+        drivers = np.array([b.kind == "driver" for b in self.bank.blocks], bool)
+        self._least = np.where(drivers, 1, np.maximum(self._widths - spare, 1))
         stacked = np.column_stack([jacobian, residual])
         pad = -stacked.shape[1] % COLUMN_STEP
         data = jnp.asarray(np.pad(np.where(self.present[:, None], stacked, 0.0), ((0, 0), (0, pad))))
@@ -227,15 +250,22 @@ class Scanner:
             t_of[here] = np.where(self._positive[here] & (b[:, 0] < 0), 0.0, t)
             q_of[here] = keep.sum(1)
             energy[here] = np.sum(values * keep, axis=1) / np.maximum(q_of[here], 1) * np.mean(norm**2, axis=1)
-        ratio = np.where(q_of > 0, log_evidence_ratio(t_of, result.rss, nu, q_of), -np.inf)
-        for name, mine in self._members.items():
-            result.energy[name] = energy[mine]
-            top = int(mine[np.argmax(ratio[mine])])
-            if np.isfinite(ratio[top]):
-                result.evidence[name] = float(log_mean(ratio[mine][np.isfinite(ratio[mine])]))
+        # A form that loses more columns than the baseline contains is another form in disguise.
+        ratio = np.where(q_of >= self._least, log_evidence_ratio(t_of, result.rss, nu, q_of), -np.inf)
+        for name, structures in self._members.items():
+            result.energy[name] = energy[np.concatenate(structures)]
+            # Structures compete by their mean over shapes; the best shape of the best structure stands for the name.
+            sound = [mine[np.isfinite(ratio[mine])] for mine in structures if np.isfinite(ratio[mine]).any()]
+            if sound:
+                means = np.array([log_mean(ratio[mine]) for mine in sound])
+                winner = sound[int(np.argmax(means))]
+                top = int(winner[np.argmax(ratio[winner])])
+                result.evidence[name] = float(log_mean(means))
                 result.best[name] = (top, float(t_of[top]), float(q_of[top]))
 
-    def _single(self, result, name: str, where: np.ndarray, b: np.ndarray, own: np.ndarray, cross: np.ndarray, nu: int) -> None:
+    def _single(
+        self, result, name: str, where: np.ndarray, b: np.ndarray, own: np.ndarray, cross: np.ndarray, nu: int
+    ) -> None:
         left = own - np.sum(cross**2, axis=1)
         keep = left > VANISHED * own
         t = np.where(keep, b**2 / np.where(keep, left, 1.0), 0.0)

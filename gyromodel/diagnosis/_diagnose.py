@@ -7,15 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from gyromodel.campaign import Campaign
-from gyromodel.diagnose._average import average
-from gyromodel.diagnose._bank import Bank, build_bank
-from gyromodel.diagnose._calibrate import null_scores
-from gyromodel.diagnose._gain import ladder_error, nested_gain, no_gain
-from gyromodel.diagnose._result import Candidate, Diagnosis, Gain, Round
-from gyromodel.diagnose._scan import Scanner
-from gyromodel.diagnose._search import Found, Progress, Ranking, Selection, is_driver, search
-from gyromodel.diagnose._variance import growing_noise, tails, with_variance
-from gyromodel.diagnose._verdict import driver_shape, judge, minimum_detectable, testable
+from gyromodel.diagnosis._average import average
+from gyromodel.diagnosis._bank import Bank, build_bank
+from gyromodel.diagnosis._calibrate import null_scores
+from gyromodel.diagnosis._gain import ladder_error, nested_gain, no_gain
+from gyromodel.diagnosis._result import Candidate, Diagnosis, Gain, Round
+from gyromodel.diagnosis._scan import Scanner
+from gyromodel.diagnosis._search import Found, Progress, Ranking, Selection, is_driver, search
+from gyromodel.diagnosis._variance import growing_noise, tails, with_variance
+from gyromodel.diagnosis._verdict import driver_shape, judge, minimum_detectable, testable
 from gyromodel.estimate import Estimate, fit_record
 from gyromodel.model import GyroModel, record_span
 from gyromodel.noise import NoiseGrid, noise_grid
@@ -32,21 +32,27 @@ class _Session:
     def __init__(self, record: Record, bank: Bank, grid: NoiseGrid, threshold: float) -> None:
         self.record, self.bank, self.grid, self.threshold = record, bank, grid, threshold
         self.scanner = Scanner(record, bank, grid)
-        self._ladder: dict[int, tuple[float, float]] = {}
+        self._ladder: dict[int, tuple[float, float, bool]] = {}
 
-    def ladder(self, estimate: Estimate) -> tuple[float, float]:
-        """Held-out rms and log score of an estimate's structure, computed once."""
+    def ladder(self, estimate: Estimate) -> tuple[float, float, bool]:
+        """Held-out rms, log score and weighting of an estimate's structure, computed once."""
         if id(estimate) not in self._ladder:
             self._ladder[id(estimate)] = ladder_error(estimate.record, estimate)
         return self._ladder[id(estimate)]
 
     def run(self, baseline: Estimate, progress: Progress = None) -> Selection:
-        """The rounds; after the first, a step must also lower the error on blocks left out."""
+        """The rounds."""
+        return search(self.record, self.scanner, baseline, self.threshold, progress=progress)
 
-        def accept(before: Estimate, after: Estimate) -> bool:
-            return before is baseline or self.ladder(after)[1] > self.ladder(before)[1]
-
-        return search(self.record, self.scanner, baseline, self.threshold, accept=accept, progress=progress)
+    def run_and_prune(self, baseline: Estimate, progress: Progress = None) -> Selection:
+        """The rounds, cut where (after the first step) the error on blocks left out stops falling."""
+        selection = self.run(baseline, progress)
+        for i in range(2, len(selection.estimates)):
+            now, before = self.ladder(selection.estimates[i]), self.ladder(selection.estimates[i - 1])
+            if selection.found[i - 1].effect is not None and now[0] > before[0] and now[1] < before[1]:
+                found, estimates = selection.found[: i - 1], selection.estimates[:i]
+                return Selection(estimates[-1], found, selection.found[i - 1].ranking, estimates, None)
+        return selection
 
 
 def diagnose(
@@ -75,7 +81,9 @@ def diagnose(
     shortened = [average(c) for c in campaigns]
     if any(m > 1 for _, m in shortened):
         most = max(m for _, m in shortened)
-        findings.append(f"Means of {most} consecutive samples were searched: lines above their sample rate and quantisation are averaged away.")
+        findings.append(
+            f"Means of {most} consecutive samples were searched: lines above their sample rate and quantisation are averaged away."
+        )
     record = read_signals([c for c, _ in shortened])
     say("fitting the simulation", 0.02)
     baseline = fit_record(record, model)
@@ -87,22 +95,28 @@ def diagnose(
     if calibrate:
         nulls = null_scores(session.scanner, baseline, calibrate, seed, say)
         session.threshold = float(np.quantile(nulls, 0.99))
-    selection = session.run(baseline, say)
+    selection = session.run_and_prune(baseline, say)
     grows = growing_noise(record, selection.estimate)
     if grows is not None:
         findings.append(f"The noise level follows {grows[0]}; samples are weighted accordingly.")
         record = with_variance(record, grows[1])
         baseline = fit_record(record, model)
         session = _Session(record, bank, grid, session.threshold)
-        selection = session.run(baseline, say)
+        selection = session.run_and_prune(baseline, say)
     heavy = tails(selection.estimate)
     findings += [heavy] if heavy else []
     say("judging", 0.65)
     judgement = judge(record, session.scanner, baseline, selection, len(bank.names()), nulls)
     unit = _rate_unit(campaigns[0])
     scale = factor("rad/s", unit)
-    extended = fit_record(selection.estimate.record, _free_noise(selection.estimate), intervals=True)
-    gain = _gain(session, baseline, selection, unit, scale, say)
+    ordinary = tuple(session.ladder(e)[2] for e in (baseline, selection.estimate))
+    if ordinary[1]:
+        findings.append(
+            "Parameters weigh all samples alike: that predicts left-out blocks better than the fitted noise's weights do."
+        )
+    final = selection.estimate
+    extended = fit_record(final.record, final.model_as_given(), intervals=True, ordinary=ordinary[1])
+    gain = _gain(session, baseline, selection, unit, scale, ordinary, say)
     driver = driver_shape(session.scanner, selection, judgement.driver, unit) if judgement.driver else None
     say("done", 1.0)
     whole = shortened[0][0] if len(shortened) == 1 else _together([c for c, _ in shortened])
@@ -135,11 +149,6 @@ def diagnose(
     )
 
 
-def _free_noise(estimate: Estimate) -> GyroModel:
-    model = estimate.model
-    return model if estimate.noise_given else GyroModel(model.effects, {}, model.fixed, model.gyro)
-
-
 def _grid(record: Record, baseline: Estimate) -> NoiseGrid:
     """Noise cells to sum over: all of the family, or the one the model states."""
     span = record_span(record)
@@ -157,7 +166,7 @@ def _rate_unit(campaign: Campaign) -> str:
     return "deg/s"
 
 
-def _gain(session: _Session, baseline: Estimate, selection: Selection, unit: str, scale: float, say) -> Gain:
+def _gain(session: _Session, baseline: Estimate, selection: Selection, unit: str, scale: float, ordinary, say) -> Gain:
     if not any(f.effect is not None for f in selection.found):
         return no_gain(session.record, baseline, unit, scale)
 
@@ -166,7 +175,13 @@ def _gain(session: _Session, baseline: Estimate, selection: Selection, unit: str
         return fold.run(base).estimate
 
     return nested_gain(
-        session.record, baseline, select, unit, scale, lambda k, n: say(f"held-out block {k} of {n}", 0.7 + 0.28 * k / n)
+        session.record,
+        baseline,
+        select,
+        unit,
+        scale,
+        ordinary,
+        lambda k, n: say(f"held-out block {k} of {n}", 0.7 + 0.28 * k / n),
     )
 
 
@@ -176,17 +191,28 @@ def _rounds(session: _Session, selection: Selection, scale: float) -> tuple[Roun
     ]
     rounds = []
     before = session.ladder(selection.estimates[0])
-    rounds.append(Round(None, 0.0, _ranking(selection.found[0].ranking if selection.found else selection.last), before[0] * scale, before[1]))
+    rounds.append(
+        Round(
+            None,
+            0.0,
+            _ranking(selection.found[0].ranking if selection.found else selection.last),
+            before[0] * scale,
+            before[1],
+        )
+    )
     for step, ranking, estimate in steps:
         assert step is not None
-        rms, score = session.ladder(estimate)
+        rms, score, _ = session.ladder(estimate)
         rounds.append(Round(step.name, ranking.statistic[step.name], _ranking(ranking), rms * scale, score))
     return tuple(rounds)
 
 
 def _ranking(ranking: Ranking) -> tuple[Candidate, ...]:
     order = sorted(ranking.statistic, key=lambda k: -ranking.statistic[k])[:12]
-    return tuple(Candidate(str(k), ranking.statistic[k], ranking.posterior[k], "driver" if is_driver(k) else "effect") for k in order)
+    return tuple(
+        Candidate(str(k), ranking.statistic[k], ranking.posterior[k], "driver" if is_driver(k) else "effect")
+        for k in order
+    )
 
 
 def _together(campaigns: list[Campaign]) -> Campaign:

@@ -75,4 +75,6 @@ def tails(estimate: Estimate) -> str | None:
     excess = stats.kurtosis(e)
     if excess / np.sqrt(24.0 / len(e)) < HEAVY:
         return None
-    return f"Residuals have heavy tails (excess kurtosis {excess:.1f}): intervals that assume normal noise are optimistic."
+    return (
+        f"Residuals have heavy tails (excess kurtosis {excess:.1f}): intervals that assume normal noise are optimistic."
+    )

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import logsumexp
 
-from gyromodel.diagnose._scan import CellResult, Scanner
+from gyromodel.diagnosis._scan import CellResult, Scanner
 from gyromodel.effects import Effect
 from gyromodel.effects.drivers import BiasPeriodic, BiasStep
 from gyromodel.estimate import Estimate, EstimateError, fit_record
@@ -98,7 +98,12 @@ def rank(scanner: Scanner, cells: list[int], estimate: Estimate, pulses: tuple[i
         marks = np.zeros((len(columns), len(pulses)))
         marks[list(pulses), np.arange(len(pulses))] = 1.0
         columns = np.concatenate([columns, marks], axis=1)
-    results = scanner.run(cells, columns, residual)
+    contained = {
+        b.name: sum(int(e.linear().size) for e in estimate.model.effects if e.label in b.effect.supersedes)
+        for b in scanner.bank.blocks
+        if b.effect is not None and b.effect.supersedes
+    }
+    results = scanner.run(cells, columns, residual, contained)
     prior = scanner.grid.log_prior
     logs = np.array([results[g].log_likelihood + prior[g] for g in cells])
     null = float(logsumexp(logs))
@@ -136,18 +141,16 @@ def search(
     baseline: Estimate,
     threshold: float,
     *,
-    accept: Callable[[Estimate, Estimate], bool] | None = None,
     progress: Progress = None,
     rounds: int = MAXIMUM_ROUNDS,
 ) -> Selection:
-    """Add candidates until nothing more is significant (or `accept` says that a step no longer helps).
+    """Add candidates until nothing more is significant.
 
     Args:
         record: the data.
         scanner: the search laid out on it.
         baseline: the fitted simulation.
         threshold: least ln evidence ratio of an addition.
-        accept: called with the estimates before and after a step; False ends the search without the step.
         progress: called with a line and the fraction done.
         rounds: at most this many additions.
     """
@@ -162,12 +165,16 @@ def search(
             break
         step = _addition(scanner, estimate, ranking, name, pulses)
         after = refit(record, baseline, [*found, step])
-        if after is None or (accept is not None and step.effect is not None and not accept(estimate, after)):
+        if after is None:
             break
         if progress:
             progress(f"found {name}", min(0.25 + 0.06 * len(found), 0.6))
         found.append(step)
         estimates.append(after)
+        if step.rows and scanner.by_points:
+            # Which points are right must be settled before anything is read into the rest.
+            ranking = rank_where_it_matters(scanner, after, step.rows)
+            break
     if sum(f.effect is not None for f in found) > 1:
         found, estimates[-1] = _exchange(record, scanner, baseline, found, estimates[-1])
     return _against_drivers(found, ranking, estimates, threshold)
@@ -265,9 +272,7 @@ def replace_fixed(model: GyroModel, fixed: frozenset[tuple[str, str]]) -> GyroMo
     return GyroModel(model.effects, model.noise, fixed, model.gyro)
 
 
-def leave_one_out(
-    record: Record, scanner: Scanner, baseline: Estimate, found: list[Found], i: int
-) -> Ranking | None:
+def leave_one_out(record: Record, scanner: Scanner, baseline: Estimate, found: list[Found], i: int) -> Ranking | None:
     """Rank all candidates beside everything found except item i."""
     others = found[:i] + found[i + 1 :]
     estimate = refit(record, baseline, others)
@@ -301,4 +306,3 @@ def _exchange(
         if after is not None:
             found, estimate = changed, after
     return found, estimate
-

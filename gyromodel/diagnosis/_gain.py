@@ -8,11 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from gyromodel.diagnose._result import Gain
+from gyromodel.diagnosis._result import Gain
 from gyromodel.estimate import Estimate, EstimateError, filter_of, fit_record, whiten_columns
-from gyromodel.model import GyroModel
-from gyromodel.noise import NoiseRatios
 from gyromodel.signals import Record
+
+
+# Ordinary weights replace the noise model's where they lower the held-out rms to less than this part.
+ORDINARY_MARGIN = 0.9
 
 
 def blocks_of(record: Record) -> list[np.ndarray]:
@@ -37,28 +39,37 @@ def _log_density(record: Record, residual: np.ndarray, estimate: Estimate) -> fl
     present = np.asarray(record.sampling.present)
     w = np.asarray(whiten_columns(filter, jnp.asarray(np.where(present, residual, 0.0))[:, None]))[:, 0]
     variance = estimate.white_variance
-    return float(-0.5 * np.sum(w**2) / variance - 0.5 * filter.log_determinant - 0.5 * present.sum() * np.log(2 * np.pi * variance))
+    return float(
+        -0.5 * np.sum(w**2) / variance
+        - 0.5 * filter.log_determinant
+        - 0.5 * present.sum() * np.log(2 * np.pi * variance)
+    )
 
 
-def fit_without(record: Record, rows: np.ndarray, model: GyroModel, ratios: NoiseRatios) -> Estimate | None:
-    """The model fitted without a block at known noise ratios; None where the rest does not determine it."""
-    try:
-        return fit_record(record.without(rows), model, ratios=ratios)
-    except EstimateError:
-        return None
+def ladder_error(record: Record, estimate: Estimate) -> tuple[float, float, bool]:
+    """Held-out error of one model structure, refitted without each block.
 
-
-def ladder_error(record: Record, estimate: Estimate) -> tuple[float, float]:
-    """Held-out rms (rad/s) and log score of one model structure, refitted without each block."""
-    errors, score = [], 0.0
+    Returns:
+        rms (rad/s), log score, and whether ordinary least squares left the smaller rms (by more than chance would at 5 %).
+    """
+    errors: dict[bool, list[np.ndarray]] = {False: [], True: []}
+    score = 0.0
     for rows in blocks_of(record):
-        train = fit_without(record, rows, estimate.model, estimate.ratios)
-        if train is None:
+        try:
+            for ordinary in errors:
+                train = fit_record(
+                    record.without(rows), estimate.model_as_given(), ratios=estimate.ratios, ordinary=ordinary
+                )
+                error, log_score = held_out(record, train, rows)
+                errors[ordinary].append(error)
+                score += 0.0 if ordinary else log_score
+        except EstimateError:
             continue
-        error, log_score = held_out(record, train, rows)
-        errors.append(error)
-        score += log_score
-    return (float(np.sqrt(np.mean(np.concatenate(errors) ** 2))), score) if errors else (np.nan, -np.inf)
+    if not errors[True]:
+        return np.nan, -np.inf, False
+    rms = {k: float(np.sqrt(np.mean(np.concatenate(v) ** 2))) for k, v in errors.items()}
+    better = rms[True] < ORDINARY_MARGIN * rms[False]
+    return rms[better], score, better
 
 
 def nested_gain(
@@ -67,6 +78,7 @@ def nested_gain(
     select: Callable[[Record, Estimate], Estimate],
     unit: str,
     scale: float,
+    ordinary: tuple[bool, bool],
     progress: Callable[[int, int], None] | None = None,
 ) -> Gain:
     """Gain on blocks that neither fit nor selection saw.
@@ -77,18 +89,19 @@ def nested_gain(
         select: repeats the whole selection on a record without a block.
         unit: reporting unit of the errors.
         scale: reporting units per rad/s.
+        ordinary: whether the model before and the one after are used with ordinary weights.
         progress: called with folds done and in all.
     """
     before, after, scores = [], [], []
     blocks = blocks_of(record)
     for k, rows in enumerate(blocks):
         try:
-            base = fit_record(record.without(rows), baseline.model if baseline.noise_given else _free(baseline.model))
+            base = fit_record(record.without(rows), baseline.model_as_given())
             extended = select(record.without(rows), base)
+            e0, s0 = _errors(record, base, rows, ordinary[0])
+            e1, s1 = _errors(record, extended, rows, ordinary[1])
         except EstimateError:
             continue
-        e0, s0 = held_out(record, base, rows)
-        e1, s1 = held_out(record, extended, rows)
         before.append(np.mean(e0**2))
         after.append(np.mean(e1**2))
         scores.append(s1 - s0)
@@ -97,14 +110,28 @@ def nested_gain(
     return _summary(np.array(before), np.array(after), np.array(scores), record.block_scheme, unit, scale)
 
 
-def _free(model: GyroModel) -> GyroModel:
-    return GyroModel(model.effects, {}, model.fixed, model.gyro)
+def _errors(record: Record, train: Estimate, rows: np.ndarray, ordinary: bool) -> tuple[np.ndarray, float]:
+    errors, score = held_out(record, train, rows)
+    if ordinary:
+        again = fit_record(train.record, train.model_as_given(), ratios=train.ratios, ordinary=True)
+        errors, _ = held_out(record, again, rows)
+    return errors, score
 
 
 def _summary(before, after, scores, scheme: str, unit: str, scale: float) -> Gain:
     folds = len(scores)
     if folds < 2:
-        return Gain(np.nan, np.nan, unit, 1.0, (0.0, np.inf), f"{scheme}: too few to hold one out", folds, 0.0, (-np.inf, np.inf))
+        return Gain(
+            np.nan,
+            np.nan,
+            unit,
+            1.0,
+            (0.0, np.inf),
+            f"{scheme}: too few to hold one out",
+            folds,
+            0.0,
+            (-np.inf, np.inf),
+        )
     rms = float(np.sqrt(before.mean()) * scale), float(np.sqrt(after.mean()) * scale)
     ratio = rms[0] / rms[1] if rms[1] > 0 else 1.0
     # Jackknife over blocks for the ratio, Student's t over blocks for the log score.
@@ -113,11 +140,31 @@ def _summary(before, after, scores, scheme: str, unit: str, scale: float) -> Gai
     t = stats.t.ppf(0.975, folds - 1)
     total, error = float(scores.sum()), float(np.sqrt(folds) * scores.std(ddof=1))
     interval = (float(ratio * np.exp(-t * spread)), float(ratio * np.exp(t * spread)))
-    return Gain(rms[0], rms[1], unit, ratio, interval, f"nested, one of {folds} {scheme} left out", folds, total, (total - t * error, total + t * error))
+    return Gain(
+        rms[0],
+        rms[1],
+        unit,
+        ratio,
+        interval,
+        f"nested, one of {folds} {scheme} left out",
+        folds,
+        total,
+        (total - t * error, total + t * error),
+    )
 
 
 def no_gain(record: Record, baseline: Estimate, unit: str, scale: float) -> Gain:
     """The gain of an unchanged model: its held-out error, twice."""
-    rms, _ = ladder_error(record, baseline)
+    rms, _, _ = ladder_error(record, baseline)
     folds = len(blocks_of(record))
-    return Gain(rms * scale, rms * scale, unit, 1.0, (1.0, 1.0), f"one of {folds} {record.block_scheme} left out", folds, 0.0, (0.0, 0.0))
+    return Gain(
+        rms * scale,
+        rms * scale,
+        unit,
+        1.0,
+        (1.0, 1.0),
+        f"one of {folds} {record.block_scheme} left out",
+        folds,
+        0.0,
+        (0.0, 0.0),
+    )

@@ -8,14 +8,12 @@ import jax
 import numpy as np
 from scipy.special import logsumexp
 
-from gyromodel.diagnose._scan import Scanner
-from gyromodel.diagnose._search import skipped
-from gyromodel.estimate import Estimate
-from gyromodel.model import record_span
-from gyromodel.noise import markov_sum
-from gyromodel.numerics.state_space import unwhiten
+from gyromodel.diagnosis._scan import Scanner
+from gyromodel.diagnosis._search import skipped
+from gyromodel.estimate import Estimate, filter_of
+from gyromodel.numerics.state_space import colour
 
-_draw = jax.jit(jax.vmap(unwhiten, in_axes=(None, None, 0)))
+_draw = jax.jit(jax.vmap(colour, in_axes=(None, 0)))
 
 
 def null_scores(
@@ -32,14 +30,15 @@ def null_scores(
     """
     record = scanner.record
     rng = np.random.default_rng(seed)
-    noise = markov_sum(baseline.ratios, record.interval, record_span(record))
     white = rng.standard_normal((draws, len(scanner.present)))
-    data = np.asarray(_draw(noise, record.sampling, jax.numpy.asarray(white)))
+    data = np.asarray(_draw(filter_of(record, baseline.ratios), jax.numpy.asarray(white)))
     _, jacobian = baseline.model.linearise(record.signals)
     columns = np.asarray(jacobian)
     skip = skipped(baseline.model)
     cells = scanner.all_cells() if baseline.noise_given else scanner.coarse_cells()
-    results = scanner.run_many(cells, columns, data.T, lambda k: say("calibrating the threshold", 0.06 + 0.18 * k / len(cells)))
+    results = scanner.run_many(
+        cells, columns, data.T, lambda k: say("calibrating the threshold", 0.06 + 0.18 * k / len(cells))
+    )
     likelihood = np.stack([results[g][0] + scanner.grid.log_prior[g] for g in cells])
     null = logsumexp(likelihood, axis=0)
     names = [n for n in results[cells[0]][1] if n not in skip]

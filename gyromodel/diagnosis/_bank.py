@@ -22,12 +22,16 @@ NOT_DRIVERS = ("segment", "run", "position")
 
 @dataclass(frozen=True)
 class Block:
-    """Columns of one form of one candidate; they stand at `start` … `start + width` of the bank."""
+    """Columns of one form of one candidate; they stand at `start` … `start + width` of the bank.
+
+    Forms of one `structure` differ only in the values of nonlinear parameters.
+    """
 
     name: str
     kind: Literal["effect", "driver"]
     start: int
     width: int
+    structure: str
     effect: Effect | None
 
 
@@ -86,10 +90,17 @@ def build_bank(record: Record, included: Iterable[str] = ()) -> Bank:
     blocks.sort(key=lambda b: b[2].shape[1])
     laid, start = [], 0
     for name, kind_of, shape, effect in blocks:
-        laid.append(Block(name, kind_of, start, shape.shape[1], effect))
+        laid.append(Block(name, kind_of, start, shape.shape[1], _structure(name, effect, shape.shape[1]), effect))
         start += shape.shape[1]
     columns = np.concatenate([b[2] for b in blocks], axis=1) if blocks else np.zeros((len(rate), 0))
     return Bank(columns, tuple(laid), tuple(scans), not_testable)
+
+
+def _structure(name: str, effect: Effect | None, width: int) -> str:
+    if effect is None:
+        return f"{name}/{width}"
+    shapes = [np.shape(getattr(effect, k)) for k in effect.declared()]
+    return f"{name}/{shapes}/{getattr(effect, 'powers', '')}"
 
 
 def _missing(kind: type[Effect], record: Record) -> str:
@@ -113,7 +124,9 @@ def _weighted(effect: Effect, signals: Signals, rate: np.ndarray) -> np.ndarray:
 
 def _smooths(record: Record) -> list[tuple[str, np.ndarray]]:
     names = driver_names(record)
-    found = [(f"smooth({name})", s) for name in (*names, "time") for s in _kernel_features(record, (name,), SMOOTH_SCALES)]
+    found = [
+        (f"smooth({name})", s) for name in (*names, "time") for s in _kernel_features(record, (name,), SMOOTH_SCALES)
+    ]
     rate_first = sorted(names, key=lambda n: n not in ("rate", "temperature"))[:4]
     pairs = [(a, b) for i, a in enumerate(rate_first) for b in rate_first[i + 1 :]]
     return found + [(f"smooth({a}, {b})", s) for a, b in pairs for s in _kernel_features(record, (a, b), PAIR_SCALES)]

@@ -33,7 +33,7 @@ def explained_for(log_ratio: float, nu: int, q: int) -> float:
     return high
 
 
-def log_mean(values: np.ndarray, axis: int = -1) -> np.ndarray:
+def log_mean(values: np.ndarray) -> float:
     """ln of the mean of exponentials."""
-    top = values.max(axis=axis, keepdims=True)
-    return np.squeeze(top, axis) + np.log(np.mean(np.exp(values - top), axis=axis))
+    top = float(values.max())
+    return top + float(np.log(np.mean(np.exp(values - top))))
