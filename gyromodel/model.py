@@ -18,7 +18,7 @@ from gyromodel.effects.drivers import BiasColumn
 from gyromodel.noise import NoiseRatios, markov_sum
 from gyromodel.numerics.state_space import build_filter, colour
 from gyromodel.signals import Record, read_signals
-from gyromodel.units import from_internal
+from gyromodel.units import convertible, from_internal
 
 
 class ModelError(ValueError):
@@ -62,7 +62,7 @@ class GyroModel(eqx.Module):
     def with_effect(self, effect: Effect) -> GyroModel:
         """The model extended by one effect, which replaces any that it contains as a special case."""
         kept = tuple(e for e in self.effects if e.label not in effect.supersedes)
-        return eqx.tree_at(lambda m: m.effects, self, (*kept, effect))
+        return GyroModel((*kept, effect), self.noise, self.fixed, self.gyro)
 
     def without(self, label: str) -> GyroModel:
         """The model less one effect (the last of that label)."""
@@ -71,12 +71,16 @@ class GyroModel(eqx.Module):
             raise ModelError(f"the model has no {label}")
         return eqx.tree_at(lambda m: m.effects, self, self.effects[:where] + self.effects[where + 1 :])
 
-    def prepared(self, signals: Signals) -> GyroModel:
-        """Reference points and start values that depend on the campaign filled in."""
+    def check_columns(self, signals: Signals) -> None:
+        """Refuse signals without a column that an effect needs."""
         for effect in self.effects:
             for name in effect.columns_needed:
                 if name not in signals:
                     raise ModelError(f"effect {effect.label} needs a column {name}, which the campaign lacks")
+
+    def prepared(self, signals: Signals) -> GyroModel:
+        """Reference points and start values that depend on the campaign filled in."""
+        self.check_columns(signals)
         return eqx.tree_at(lambda m: m.effects, self, tuple(e.prepared(signals) for e in self.effects))
 
     def slots(self) -> tuple[Slot, ...]:
@@ -171,7 +175,7 @@ def effect_class(label: str) -> type[Effect]:
     """The catalogue class of a public id; bias_<column> is a linear driver."""
     if label in CATALOGUE and label != "bias_column":
         return CATALOGUE[label]
-    if label.startswith("bias_") and label != "bias_column":
+    if label.startswith("bias_") and label not in ("bias_", "bias_column"):
         return BiasColumn
     known = ", ".join(sorted(set(CATALOGUE) - {"bias_column"}))
     raise ModelError(f"unknown effect {label}; the catalogue has {known}, and bias_<column> for any other column")
@@ -191,12 +195,36 @@ def model_from_effects(labels: Iterable[str], gyro: str = "") -> GyroModel:
 def parameter_unit(effect: Effect, field: str, output_unit: str, units: Mapping[str, str]) -> str:
     """The unit a parameter is reported in; a gain's follows the output, a linear driver's its column (file units)."""
     if effect.site == "gain":
-        return "1" if output_unit == "rad/s" else f"{output_unit}/(deg/s)"
+        if output_unit == "rad/s":
+            return "1"
+        return f"{output_unit[:-2]}/deg" if output_unit.endswith("/s") else f"{output_unit}/(deg/s)"
     unit = effect.declared()[field].unit
     if isinstance(effect, BiasColumn):
         column = units.get(effect.column, "")
         return f"{unit}/({column})" if column not in ("", "1") else unit
     return unit
+
+
+def check_units(model: GyroModel, output_unit: str, units: Mapping[str, str]) -> None:
+    """Refuse a scale factor or a driver's coefficient that was written in a unit which does not suit the campaign.
+
+    Counts may leave out "per second", in the output as in the scale factor: count/deg and count/(deg/s) mean the same.
+    """
+    for effect in model.effects:
+        written = getattr(effect, "unit", "")
+        if not written:
+            continue
+        name = next(iter(effect.declared()))
+        accepted = [parameter_unit(effect, name, output_unit, units)]
+        what = f"column {effect.column} is in [{units.get(effect.column, '')}]" if isinstance(effect, BiasColumn) else ""
+        if effect.site == "gain":
+            what = f"the output is in [{output_unit}]"
+            raw = output_unit.removesuffix("/s")
+            accepted = [f"{raw}/deg", f"{raw}/(deg/s)"] if raw in ("count", "bit") else accepted
+        if not any(convertible(written, unit) for unit in accepted):
+            given = "a plain number" if written == "1" else f"in {written}"
+            expected = " or ".join("a plain number" if unit == "1" else unit for unit in accepted)
+            raise ModelError(f"{effect.label} is {given}, but {what}: expected {expected}")
 
 
 def simulate(model: GyroModel, campaign: Campaign, seed: int = 0) -> Campaign:
@@ -211,6 +239,7 @@ def simulate(model: GyroModel, campaign: Campaign, seed: int = 0) -> Campaign:
     unset = [e.label for e in model.effects if not np.isfinite(np.asarray(e.linear())).all()]
     if unset:
         raise ModelError(f"effect {unset[0]} has no value; fit the model or write one to simulate")
+    check_units(model, record.output_unit, record.units)
     model = model.prepared(record.signals)
     output = np.asarray(model.predict(record.signals))[: record.rows]
     output = output + draw_noise(model, record, np.random.default_rng(seed))

@@ -19,6 +19,8 @@ from gyromodel.units import internal_unit
 
 # A step this many times the median one separates stretches of a record.
 GAP = 10.0
+# A step this many times the median one leaves out samples.
+INCREMENT_GAP = 1.5
 
 
 class Record(NamedTuple):
@@ -51,7 +53,7 @@ class Record(NamedTuple):
 
 
 def padded_length(rows: int) -> int:
-    """The smallest of 1, 1.25, 1.5, 1.75 × 2^k that holds the rows."""
+    """The smallest of 1, 1.25, 1.5, 1.75 × 2^k that holds the rows; below 64 the next multiple of 16."""
     step = max(2 ** (max(rows, 64).bit_length() - 3), 16)
     return -(-rows // step) * step
 
@@ -69,7 +71,8 @@ def rate_output(campaign: Campaign) -> tuple[np.ndarray, str]:
         output = np.diff(output, prepend=np.nan)
     interval = np.diff(campaign.si("time"), prepend=np.nan)
     interval[0] = np.median(interval[1:])
-    return output / interval, f"{unit}/s"
+    # What was turned through during a gap is not known: the first increment behind one is missing.
+    return np.where(interval > INCREMENT_GAP * interval[0], np.nan, output / interval), f"{unit}/s"
 
 
 def _stretches(time: np.ndarray) -> np.ndarray:
@@ -89,8 +92,8 @@ def _blocks(campaign: Campaign, time: np.ndarray) -> tuple[np.ndarray, str]:
             numbers = np.unique(values, return_inverse=True)[1]
             if 4 <= numbers.max() + 1 <= 60:
                 return numbers, f"{name}s"
-    parts = np.minimum((np.arange(len(time)) * 8) // len(time), 7)
-    return parts, "eighths of the record"
+    parts = (np.arange(len(time)) * 6) // len(time)
+    return parts, "sixths of the record"
 
 
 def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
@@ -100,9 +103,9 @@ def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
         CampaignError: columns, units or kinds of the campaigns do not match.
     """
     campaigns = [campaigns] if isinstance(campaigns, Campaign) else list(campaigns)
-    names = [n for n in campaigns[0].columns if not n.startswith("output")]
+    names = ["time", *campaigns[0].covariates]
     for other in campaigns[1:]:
-        missing = set(names) ^ {n for n in other.columns if not n.startswith("output")}
+        missing = set(names) ^ {"time", *other.covariates}
         if missing:
             raise CampaignError(
                 f"{other.name}: campaigns fitted together need the same columns; {min(missing)} is in only some"
@@ -117,7 +120,7 @@ def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
         unit = this_unit
         columns = {n: campaign.si(n) for n in names}
         columns["time"] = time - time[0]
-        columns["time_on"] = columns["time"] + float(campaign.metadata.get("time_since_power_on", 0.0))
+        columns["time_on"] = columns["time"] + _power_on(campaign)
         if "temperature" in columns:
             stretch = _stretches(time)
             columns["temperature_rate"] = np.concatenate(
@@ -138,6 +141,14 @@ def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
     units = {n: campaigns[0].units[n] for n in names}
     record = _pad(signals, np.concatenate(blocks), " and ".join(sorted(schemes)), unit, units)
     return record._replace(data_hash="+".join(c.digest() for c in campaigns))
+
+
+def _power_on(campaign: Campaign) -> float:
+    """Time from power-on to the first row (s)."""
+    value = campaign.metadata.get("time_since_power_on", 0.0)
+    if isinstance(value, str):
+        raise CampaignError(f"{campaign.name}: metadata time_since_power_on is {value!r}, expected a number of seconds")
+    return float(value)
 
 
 def _thermometer_rate(time: np.ndarray, temperature: np.ndarray) -> np.ndarray:

@@ -127,7 +127,7 @@ def _smooths(record: Record) -> list[tuple[str, np.ndarray]]:
     found = [
         (f"smooth({name})", s) for name in (*names, "time") for s in _kernel_features(record, (name,), SMOOTH_SCALES)
     ]
-    rate_first = sorted(names, key=lambda n: n not in ("rate", "temperature"))[:4]
+    rate_first = sorted(names, key=lambda n: n not in ("rate", "temperature"))[:3]
     pairs = [(a, b) for i, a in enumerate(rate_first) for b in rate_first[i + 1 :]]
     return found + [(f"smooth({a}, {b})", s) for a, b in pairs for s in _kernel_features(record, (a, b), PAIR_SCALES)]
 

@@ -10,10 +10,10 @@ from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._average import average
 from gyromodel.diagnosis._bank import Bank, build_bank
 from gyromodel.diagnosis._calibrate import null_scores
-from gyromodel.diagnosis._gain import ladder_error, nested_gain, no_gain
+from gyromodel.diagnosis._gain import ladder_error, nested_gain, no_gain, not_measured
 from gyromodel.diagnosis._result import Candidate, Diagnosis, Gain, Round
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._search import Found, Progress, Ranking, Selection, is_driver, search
+from gyromodel.diagnosis._search import Found, Progress, Ranking, Selection, cells_of_weight, is_driver, search
 from gyromodel.diagnosis._variance import growing_noise, tails, with_variance
 from gyromodel.diagnosis._verdict import driver_shape, judge, minimum_detectable, testable
 from gyromodel.estimate import Estimate, fit_record
@@ -24,6 +24,8 @@ from gyromodel.units import convertible, factor
 
 # ln of the evidence ratio that no noise in or near the family reaches once in a hundred campaigns.
 SAFE_THRESHOLD = 5.0
+# Folds search the noise cells within this many nats of the best of the main pass.
+FOLD_NEARBY = 5.0
 
 
 class _Session:
@@ -59,6 +61,7 @@ def diagnose(
     campaigns: Campaign | Sequence[Campaign],
     model: GyroModel,
     *,
+    hold_out: bool = True,
     calibrate: int = 0,
     seed: int = 0,
     progress: Progress = None,
@@ -68,6 +71,7 @@ def diagnose(
     Args:
         campaigns: measured data of one unit; long ones are averaged first, and the findings say so.
         model: what the simulation contains.
+        hold_out: whether to repeat the search without each block for the gain on data not seen; the slower half of the work.
         calibrate: draws of simulated data with nothing hidden that set the threshold; 0 takes the safe threshold.
         seed: of those draws.
         progress: called with a line and the fraction done.
@@ -95,28 +99,29 @@ def diagnose(
     if calibrate:
         nulls = null_scores(session.scanner, baseline, calibrate, seed, say)
         session.threshold = float(np.quantile(nulls, 0.99))
-    selection = session.run_and_prune(baseline, say)
+    look = session.run_and_prune if hold_out else session.run
+    selection = look(baseline, say)
     grows = growing_noise(record, selection.estimate)
     if grows is not None:
         findings.append(f"The noise level follows {grows[0]}; samples are weighted accordingly.")
         record = with_variance(record, grows[1])
         baseline = fit_record(record, model)
         session = _Session(record, bank, grid, session.threshold)
-        selection = session.run_and_prune(baseline, say)
+        selection = (session.run_and_prune if hold_out else session.run)(baseline, say)
     heavy = tails(selection.estimate)
     findings += [heavy] if heavy else []
     say("judging", 0.65)
     judgement = judge(record, session.scanner, baseline, selection, len(bank.names()), nulls)
     unit = _rate_unit(campaigns[0])
     scale = factor("rad/s", unit)
-    ordinary = tuple(session.ladder(e)[2] for e in (baseline, selection.estimate))
+    ordinary = tuple(hold_out and session.ladder(e)[2] for e in (baseline, selection.estimate))
     if ordinary[1]:
         findings.append(
             "Parameters weigh all samples alike: that predicts left-out blocks better than the fitted noise's weights do."
         )
     final = selection.estimate
     extended = fit_record(final.record, final.model_as_given(), intervals=True, ordinary=ordinary[1])
-    gain = _gain(session, baseline, selection, unit, scale, ordinary, say)
+    gain = not_measured(unit) if not hold_out else _gain(session, baseline, selection, unit, scale, ordinary, say)
     driver = driver_shape(session.scanner, selection, judgement.driver, unit) if judgement.driver else None
     say("done", 1.0)
     whole = shortened[0][0] if len(shortened) == 1 else _together([c for c, _ in shortened])
@@ -131,7 +136,7 @@ def diagnose(
         minimum_detectable=minimum_detectable(session.scanner, selection.last, session.threshold, unit),
         not_testable=bank.not_testable | testable(session.scanner, selection.last),
         noise=extended.noise_table(),
-        rounds=_rounds(session, selection, scale),
+        rounds=_rounds(session, selection, scale, hold_out),
         credible_set=judgement.credible_set,
         unexplained=judgement.unexplained,
         findings=(*findings, *judgement.findings),
@@ -170,8 +175,12 @@ def _gain(session: _Session, baseline: Estimate, selection: Selection, unit: str
     if not any(f.effect is not None for f in selection.found):
         return no_gain(session.record, baseline, unit, scale)
 
+    rankings = [f.ranking for f in selection.found] + [selection.last]
+    cells = sorted({g for ranking in rankings for g in cells_of_weight(ranking, FOLD_NEARBY)})
+
     def select(record: Record, base: Estimate) -> Estimate:
         fold = _Session(record, session.bank, session.grid, session.threshold)
+        fold.scanner.only_cells = cells
         return fold.run(base).estimate
 
     return nested_gain(
@@ -185,12 +194,13 @@ def _gain(session: _Session, baseline: Estimate, selection: Selection, unit: str
     )
 
 
-def _rounds(session: _Session, selection: Selection, scale: float) -> tuple[Round, ...]:
+def _rounds(session: _Session, selection: Selection, scale: float, hold_out: bool) -> tuple[Round, ...]:
     steps: list[tuple[Found | None, Ranking, Estimate]] = [
         (f, f.ranking, e) for f, e in zip(selection.found, selection.estimates[1:], strict=False)
     ]
     rounds = []
-    before = session.ladder(selection.estimates[0])
+    unknown = (np.nan, np.nan, False)
+    before = session.ladder(selection.estimates[0]) if hold_out else unknown
     rounds.append(
         Round(
             None,
@@ -202,7 +212,7 @@ def _rounds(session: _Session, selection: Selection, scale: float) -> tuple[Roun
     )
     for step, ranking, estimate in steps:
         assert step is not None
-        rms, score, _ = session.ladder(estimate)
+        rms, score, _ = session.ladder(estimate) if hold_out else unknown
         rounds.append(Round(step.name, ranking.statistic[step.name], _ranking(ranking), rms * scale, score))
     return tuple(rounds)
 

@@ -168,3 +168,8 @@ def no_gain(record: Record, baseline: Estimate, unit: str, scale: float) -> Gain
         0.0,
         (0.0, 0.0),
     )
+
+
+def not_measured(unit: str) -> Gain:
+    """The gain where no block was held out."""
+    return Gain(np.nan, np.nan, unit, np.nan, (np.nan, np.nan), "not measured", 0, np.nan, (np.nan, np.nan))

@@ -27,9 +27,9 @@ from gyromodel.signals import Record
 
 # A candidate whose columns keep less than this share of their energy beside the baseline cannot be tested.
 VANISHED = 1e-6
-# A line's energy is computed exactly at all frequencies of a short record; of a long one at the lowest, at log-spaced ones to
-# interpolate between, and at the leading peaks of each pass.
-EXACT_LINES, LOWEST_LINES, SPACED_LINES, PEAKS = 2500, 24, 40, 12
+# A line's energy is computed exactly at the lowest frequencies, at log-spaced ones to interpolate between, and at the leading
+# peaks of each pass, whose correction holds for their neighbours too.
+LOWEST_LINES, SPACED_LINES, PEAKS, PEAK_WIDTH = 24, 40, 12, 6
 COLUMN_STEP = 16
 THREADS = 2
 # Records this short are test points, each of which may be anomalous; longer ones are series with single gross errors.
@@ -65,10 +65,9 @@ def line_grid(record: Record) -> LineGrid:
     length = scipy.fft.next_fast_len(int(np.ceil(4.0 * (span + grid) / grid)), real=True)
     frequencies = np.arange(1, length // 2 + 1) / (length * grid)
     frequencies = frequencies[frequencies < 0.5 / record.interval * (1 - 0.5 / record.rows)]
-    exact = np.arange(len(frequencies))
-    if len(exact) > EXACT_LINES:
-        spaced = np.geomspace(LOWEST_LINES + 1, len(frequencies), SPACED_LINES).round().astype(int) - 1
-        exact = np.unique(np.concatenate([exact[:LOWEST_LINES], np.clip(spaced, 0, len(frequencies) - 1)]))
+    exact = np.arange(min(LOWEST_LINES, len(frequencies)))
+    spaced = np.geomspace(len(exact) + 1, len(frequencies), SPACED_LINES).round().astype(int) - 1
+    exact = np.unique(np.concatenate([exact, np.clip(spaced, 0, len(frequencies) - 1)]))
     phase = 2.0 * np.pi * time[:, None] * frequencies[exact]
     index = np.minimum(np.round(time / grid).astype(int), length - 1)
     return LineGrid(frequencies, index, length, exact, np.concatenate([np.cos(phase), np.sin(phase)], axis=1))
@@ -107,6 +106,7 @@ class Scanner:
         self.steps = single and "bias_step" in bank.scans
         self.lines = line_grid(record) if single and "bias_periodic" in bank.scans and record.rows >= 16 else None
         self.outliers = outliers
+        self.only_cells = self.all_cells() if len(grid.log_prior) == 1 else None
         self.by_points = int(self.present.sum()) <= TEST_POINTS
         self.cells: dict[int, Cell] = {}
         extra = self.lines.basis if self.lines else np.zeros((len(self.present), 0))
@@ -154,8 +154,9 @@ class Scanner:
         w = np.asarray(whiten_columns(filter, self._raw))
         blocks = {}
         for q, (_, count, start) in self._layout.items():
-            part = w[:, start : start + q * count].T.reshape(count, q, -1)
-            blocks[q] = part @ part.transpose(0, 2, 1)
+            part = w[:, start : start + q * count]
+            gram = (part.T @ part).reshape(count, q, count, q)
+            blocks[q] = np.ascontiguousarray(np.einsum("bicj->bcij", gram)[np.arange(count), np.arange(count)])
         line = np.zeros((0, 2, 2))
         if self.lines:
             lw = w[:, self.bank.columns.shape[1] :][:, : self.lines.basis.shape[1]]
@@ -308,12 +309,11 @@ class Scanner:
         keep = (determinant > 1e-3 * own) & (a11 > 0)
         bc, bs = c[:, -1], s[:, -1]
         t = np.where(keep, (a22 * bc**2 - 2 * a12 * bc * bs + a11 * bs**2) / np.where(keep, determinant, 1.0), 0.0)
-        if len(grid.exact) < count:
-            self._exact_peaks(cell, t, c, s)
+        self._exact_peaks(cell, t, c, s)
         self._record(result, "bias_periodic", np.arange(count), t, np.where(keep, a11, 0.0), 2, nu)
 
     def _exact_peaks(self, cell: Cell, t: np.ndarray, c: np.ndarray, s: np.ndarray) -> None:
-        """Replace the leading peaks' statistic, in place, by the one with their exact energy."""
+        """Correct the statistic around the leading peaks, in place, by their exact energy."""
         assert self.lines is not None
         local = np.flatnonzero((t[1:-1] >= t[:-2]) & (t[1:-1] >= t[2:])) + 1
         peaks = local[np.argsort(-t[local])][:PEAKS]
@@ -325,7 +325,10 @@ class Scanner:
             cross = np.stack([c[k], s[k]])
             a = pair.T @ pair - cross[:, :-1] @ cross[:, :-1].T
             sound = np.linalg.det(a) > 1e-3 * np.prod(np.sum(pair**2, axis=0))
-            t[k] = cross[:, -1] @ np.linalg.solve(a, cross[:, -1]) if sound else 0.0
+            right = float(cross[:, -1] @ np.linalg.solve(a, cross[:, -1])) if sound else 0.0
+            around = slice(max(k - PEAK_WIDTH, 0), k + PEAK_WIDTH + 1)
+            t[around] = np.minimum(t[around] * (right / t[k] if t[k] > 0 else 0.0), right)
+
 
     def _record(self, result, name: str, where: np.ndarray, t: np.ndarray, energy: np.ndarray, q: int, nu: int) -> None:
         if not len(where):
@@ -362,7 +365,7 @@ def _line_energy(whitened: np.ndarray, grid: LineGrid) -> np.ndarray:
     mean = np.interp(np.log(grid.frequencies), np.log(grid.frequencies[grid.exact]), 0.5 * (cc + ss))
     out = np.zeros((len(grid.frequencies), 2, 2))
     out[:, 0, 0] = out[:, 1, 1] = mean
-    low = (grid.exact < LOWEST_LINES) | (len(grid.exact) == len(grid.frequencies))
+    low = grid.exact < LOWEST_LINES
     i = grid.exact[low]
     out[i, 0, 0], out[i, 1, 1] = cc[low], ss[low]
     out[i, 0, 1] = out[i, 1, 0] = cs[low]

@@ -121,18 +121,24 @@ def rank(scanner: Scanner, cells: list[int], estimate: Estimate, pulses: tuple[i
 def rank_where_it_matters(scanner: Scanner, estimate: Estimate, pulses: tuple[int, ...]) -> Ranking:
     """Rank over the noise cells that matter: every other level, then the neighbours of those with weight for a candidate."""
     skip = skipped(estimate.model)
-    if estimate.noise_given:
-        return rank(scanner, scanner.all_cells(), estimate, pulses, skip)
+    if scanner.only_cells is not None:
+        return rank(scanner, scanner.only_cells, estimate, pulses, skip)
     ranking = rank(scanner, scanner.coarse_cells(), estimate, pulses, skip)
-    weights = {g: r.log_likelihood + scanner.grid.log_prior[g] for g, r in ranking.results.items()}
+    near = set(cells_of_weight(ranking, NEARBY))
+    return rank(scanner, scanner.neighbours(near), estimate, pulses, skip)
+
+
+def cells_of_weight(ranking: Ranking, nats: float) -> list[int]:
+    """Noise cells within some nats of the best, for nothing added or for a candidate that matters."""
+    weights = {g: r.log_likelihood + ranking.log_prior[g] for g, r in ranking.results.items()}
     near: set[int] = set()
     for name in [None, *ranking.statistic]:
-        if name is not None and ranking.statistic[name] < min(ranking.score - NEARBY, 0.0):
+        if name is not None and ranking.statistic[name] < min(ranking.score - nats, 0.0):
             continue
         of = {g: w + (ranking.results[g].evidence.get(name, -np.inf) if name else 0.0) for g, w in weights.items()}
         best = max(of.values())
-        near |= {g for g, v in of.items() if v > best - NEARBY}
-    return rank(scanner, scanner.neighbours(near), estimate, pulses, skip)
+        near |= {g for g, v in of.items() if v > best - nats}
+    return sorted(near)
 
 
 def search(

@@ -22,6 +22,14 @@ def curve_columns(
     return jnp.stack(columns, axis=1)
 
 
+def check_curve(coefficients: Array, hinges: Array, breakpoints: Array) -> None:
+    """Refuse a curve without terms, or hinges without their breakpoints."""
+    if hinges.shape != breakpoints.shape:
+        raise ValueError("a curve has one breakpoint for each hinge")
+    if coefficients.size + hinges.size == 0:
+        raise ValueError("a curve needs a coefficient or a hinge")
+
+
 def curve_forms(x: Float[Array, " sample"]) -> list[dict[str, np.ndarray]]:
     """Zero-amplitude forms of a curve: quadratic, cubic, a line with one hinge, a line with two."""
     low, high = float(jnp.nanmin(x)), float(jnp.nanmax(x))

@@ -94,7 +94,10 @@ class BiasPeriodic(Effect):
 
 
 class BiasColumn(Effect):
-    """D += D_X (X − X0): bias proportional to another measured column X; its id is bias_<column>."""
+    """D += D_X (X − X0): bias proportional to another measured column X; its id is bias_<column>.
+
+    `unit` is what the coefficient was written in; empty, it follows the column.
+    """
 
     id = "bias_column"
     site = "rate"
@@ -104,6 +107,7 @@ class BiasColumn(Effect):
 
     coefficient: Float[Array, ""] = parameter("deg/h", 1.0, "bias per unit of the column, in the column's unit")
     column: str = eqx.field(static=True, default="")
+    unit: str = eqx.field(static=True, default="")
     reference: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(jnp.nan), converter=jnp.asarray)
 
     @property

@@ -12,11 +12,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from gyromodel.effects._base import Effect, Signals, parameter, round_reference, stack
-from gyromodel.effects._shapes import curve_columns, curve_forms
+from gyromodel.effects._shapes import check_curve, curve_columns, curve_forms
 
 
 class ScaleFactor(Effect):
-    """output = S0 · (rate + …): the gain from input rate to output."""
+    """output = S0 · (rate + …): the gain from input rate to output.
+
+    `unit` is what the value was written in, "1" for a plain number; empty, it follows the campaign's output.
+    """
 
     id = "scale_factor"
     site = "gain"
@@ -25,6 +28,7 @@ class ScaleFactor(Effect):
     test = "Calibrate the rate table against a second reference: its rate error looks the same."
 
     value: Float[Array, ""] = parameter("1", 1.0, "output per unit of input rate", default=jnp.nan)
+    unit: str = eqx.field(static=True, default="")
 
     def prepared(self, signals: Signals) -> Self:
         """Start at the slope of output over rate."""
@@ -35,7 +39,7 @@ class ScaleFactor(Effect):
         centred = rate[good] - rate[good].mean()
         energy = float(centred @ centred)
         slope = float(centred @ output[good]) / energy if energy > 0 else 1.0
-        return type(self)(value=slope if slope != 0 else 1.0)
+        return type(self)(value=slope if slope != 0 else 1.0, unit=self.unit)
 
 
 class ScaleAsymmetry(Effect):
@@ -63,13 +67,21 @@ class ScaleNonlinearity(Effect):
     cause = "The readout electronics, the modulation depth or the table response bends the input-output curve."
     test = "Run the rates in random order: self-heating at speed follows time, a nonlinearity follows rate."
 
-    coefficients: Float[Array, " term"] = parameter("ppm", 100.0, "each power's part of the output at full_rate, of it")
+    coefficients: Float[Array, " term"] = parameter(
+        "ppm", 100.0, "each power's part of the output at full_rate, of it", default=()
+    )
     powers: tuple[int, ...] = eqx.field(static=True, default=(2, 3, 4, 5))
     full_rate: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(jnp.nan), converter=jnp.asarray)
 
     def __post_init__(self) -> None:
-        if np.ndim(self.coefficients) == 0:
+        if np.size(self.coefficients) == 0:
             self.coefficients = jnp.zeros(len(self.powers))
+
+    def __check_init__(self) -> None:
+        if not self.powers or min(self.powers) < 2 or len(set(self.powers)) < len(self.powers):
+            raise ValueError("powers of the rate are different whole numbers from 2 on")
+        if self.coefficients.shape != (len(self.powers),):
+            raise ValueError(f"{len(self.powers)} powers need as many coefficients")
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """(rate/full_rate)^(i-1): times the rate, the output error of power i."""
@@ -80,7 +92,8 @@ class ScaleNonlinearity(Effect):
         """Express the coefficients at the largest rate of the campaign."""
         if np.isfinite(float(self.full_rate)):
             return self
-        return eqx.tree_at(lambda e: e.full_rate, self, jnp.max(jnp.abs(signals["rate"])))
+        top = jnp.nanmax(jnp.abs(signals["rate"]))
+        return eqx.tree_at(lambda e: e.full_rate, self, jnp.where(top > 0, top, 1.0))
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
@@ -122,7 +135,7 @@ class ScaleSagnacSine(Effect):
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
         """Sagnac phases of 0.1 to 3 rad at the largest rate."""
-        top = float(jnp.max(jnp.abs(signals["rate"])))
+        top = float(jnp.nanmax(jnp.abs(signals["rate"])))
         return [cls(kappa=phase / top) for phase in np.geomspace(0.1, 3.0, 12)] if top > 0 else []
 
 
@@ -159,14 +172,13 @@ class ScaleTemperatureCurve(Effect):
     test = "An independent thermometer: a thermometer error puts the same ripple into every term."
     supersedes = ("scale_temperature",)
 
-    coefficients: Float[Array, " order"] = parameter("ppm", 100.0, "power i: part per (10 °C)^i")
+    coefficients: Float[Array, " order"] = parameter("ppm", 100.0, "power i: part per (10 °C)^i", default=(0.0, 0.0))
     hinges: Float[Array, " hinge"] = parameter("ppm/degC", 10.0, "change of slope at each breakpoint", default=())
     breakpoints: Float[Array, " hinge"] = parameter("degC", 10.0, "where the slope changes", linear=False, default=())
     reference: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(jnp.nan), converter=jnp.asarray)
 
-    def __post_init__(self) -> None:
-        if np.ndim(self.coefficients) == 0:
-            self.coefficients = jnp.zeros(2)
+    def __check_init__(self) -> None:
+        check_curve(self.coefficients, self.hinges, self.breakpoints)
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """Powers, then hinges."""
@@ -195,14 +207,18 @@ class ScaleSpline(Effect):
     test = "Repeat the rates in both directions and random order: anomalous test points and resonances do not come back alike."
     supersedes = ("scale_nonlinearity",)
 
-    coefficients: Float[Array, " bend"] = parameter("ppm", 100.0, "bends, as parts of full_rate")
+    coefficients: Float[Array, " bend"] = parameter("ppm", 100.0, "bends, as parts of the largest rate", default=())
     knots: int = eqx.field(static=True, default=6)
     full_rate: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(jnp.nan), converter=jnp.asarray)
     lowest: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(jnp.nan), converter=jnp.asarray)
 
     def __post_init__(self) -> None:
-        if np.ndim(self.coefficients) == 0:
-            self.coefficients = jnp.zeros(self.knots - 2)
+        if np.size(self.coefficients) == 0:
+            self.coefficients = jnp.zeros(max(self.knots - 2, 0))
+
+    def __check_init__(self) -> None:
+        if self.knots < 3 or self.coefficients.shape != (self.knots - 2,):
+            raise ValueError("a spline of n knots, three or more, has n - 2 coefficients")
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """Truncated cubes that are straight outside the outer knots, less their tangent at rest.

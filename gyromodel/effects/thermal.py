@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from gyromodel.effects._base import Effect, Signals, parameter, round_reference, stack
-from gyromodel.effects._shapes import curve_columns, curve_forms
+from gyromodel.effects._shapes import check_curve, curve_columns, curve_forms
 
 
 class BiasTemperature(Effect):
@@ -46,14 +46,13 @@ class BiasTemperatureCurve(Effect):
     test = "A second start at another temperature separates warm-up; an independent thermometer separates its error."
     supersedes = ("bias_temperature",)
 
-    coefficients: Float[Array, " order"] = parameter("deg/h", 1.0, "power i: bias per (10 °C)^i")
+    coefficients: Float[Array, " order"] = parameter("deg/h", 1.0, "power i: bias per (10 °C)^i", default=(0.0, 0.0))
     hinges: Float[Array, " hinge"] = parameter("deg/h/degC", 1.0, "change of slope at each breakpoint", default=())
     breakpoints: Float[Array, " hinge"] = parameter("degC", 10.0, "where the slope changes", linear=False, default=())
     reference: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(jnp.nan), converter=jnp.asarray)
 
-    def __post_init__(self) -> None:
-        if np.ndim(self.coefficients) == 0:
-            self.coefficients = jnp.zeros(2)
+    def __check_init__(self) -> None:
+        check_curve(self.coefficients, self.hinges, self.breakpoints)
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """Powers, then hinges."""
@@ -108,6 +107,6 @@ class BiasWarmup(Effect):
     def candidates(cls, signals: Signals) -> list[Self]:
         """Time constants from some samples to the whole run."""
         on = np.asarray(signals["time_on"])
-        span = float(on[-1] - on[0])
+        span = float(on.max() - on.min())
         shortest = max(span / 200.0, 2.0 * float(np.median(np.diff(on))))
         return [cls(time_constant=tau) for tau in np.geomspace(shortest, span, 14)]

@@ -130,6 +130,6 @@ class Estimate:
         }
 
 
-def noise_coefficients(ratios: NoiseRatios, white_variance: float, record: Record, gain: float) -> dict[str, float]:
-    """Noise coefficients as input rates."""
+def noise_coefficients(ratios: NoiseRatios, white_variance: Any, record: Record, gain: float) -> dict[str, Any]:
+    """Noise coefficients as input rates, of one noise cell or of arrays of them."""
     return coefficients(ratios, white_variance / gain**2, record.interval)

@@ -12,7 +12,7 @@ import numpy as np
 from gyromodel.campaign import Campaign
 from gyromodel.estimate._estimate import Estimate, EstimateError, noise_coefficients
 from gyromodel.estimate._optimistix import optimistix_solution
-from gyromodel.model import GyroModel, ModelError, record_span
+from gyromodel.model import GyroModel, ModelError, check_units, record_span
 from gyromodel.noise import NoiseRatios, markov_sum, noise_grid, restricted_likelihood
 from gyromodel.numerics.least_squares import Normal, Solution, levenberg_marquardt
 from gyromodel.numerics.state_space import Filter, build_filter, colour, whiten
@@ -23,6 +23,10 @@ Progress = Callable[[str, float], None] | None
 
 # Relative size of a singular value of the whitened, column-scaled Jacobian below which a direction is not determined.
 SINGULAR = 1e-7
+# Levels of each noise ratio over its likely range, for the intervals of the noise coefficients.
+INTERVAL_LEVELS = 16
+# Half the 95 % point of chi-squared with one degree of freedom.
+REJECTED = 1.92
 
 
 def fit(
@@ -75,8 +79,9 @@ def fit_record(
     """
     if not jnp.zeros(()).dtype == jnp.float64:
         raise EstimateError("JAX runs in single precision; import gyromodel before using jax, or set JAX_ENABLE_X64=1")
-    model = model.prepared(record.signals)
     check_covariates(record, model)
+    check_units(model, record.output_unit, record.units)
+    model = model.prepared(record.signals)
     if record.present.sum() <= len(model.slots()) + 1:
         raise EstimateError(
             f"{int(record.present.sum())} samples cannot determine {len(model.slots())} parameters and their noise"
@@ -104,7 +109,8 @@ def fit_record(
 
 
 def check_covariates(record: Record, model: GyroModel) -> None:
-    """Refuse missing values in a column that an effect needs."""
+    """Refuse missing values in a column that an effect needs, and a missing column."""
+    model.check_columns(record.signals)
     for effect in model.effects:
         for name in effect.columns_needed:
             bad = np.flatnonzero(~np.isfinite(np.asarray(record.signals[name])[: record.rows]) & record.present)
@@ -225,7 +231,7 @@ def _finish(
     likelihood = restricted_likelihood(one, *args)
     gain = float(model.gain())
     noise = dict(model.noise) or noise_coefficients(ratios, variance, record, gain)
-    spans = _noise_intervals(args, ratios, record, gain) if intervals and not model.noise else {}
+    spans = _noise_intervals(args, record, gain) if intervals and not model.noise else {}
     rows = record.rows
     whitened = np.full(rows, np.nan)
     whitened[record.present] = w[:, p] / np.sqrt(variance)
@@ -254,6 +260,9 @@ def unit_covariance(whitened_jacobian: np.ndarray, model: GyroModel) -> np.ndarr
         return np.zeros((0, 0))
     slots = model.slots()
     norm = np.linalg.norm(whitened_jacobian, axis=0)
+    if not np.isfinite(norm).all():
+        lost = sorted({model.labels[slots[i].effect] for i in np.flatnonzero(~np.isfinite(norm))})
+        raise EstimateError(f"the fit ran away in {', '.join(lost)}: give start values, or fix some parameters")
     if (norm == 0).any():
         silent = sorted({model.labels[slots[i].effect] for i in np.flatnonzero(norm == 0)})
         raise EstimateError(
@@ -288,34 +297,29 @@ def _coloured_transposed(filter: Filter, columns):
     return jax.vmap(lambda c: transposed(c)[0], in_axes=1, out_axes=1)(columns)
 
 
-def _noise_intervals(args, ratios: NoiseRatios, record: Record, gain: float) -> dict[str, tuple[float, float]]:
-    """95 % intervals from slices of the restricted likelihood through its maximum, one per ratio."""
-    grid = noise_grid(int(record.present.sum()), record.interval, record_span(record)).ratios
-    spans: dict[str, list[float]] = {}
-    whites: list[tuple[float, float]] = []
-    for axis, name in enumerate(("noise_flicker", "noise_random_walk")):
-        levels = np.unique(np.asarray(grid[axis]))
-        centre = float(ratios[axis])
-        fine = centre * np.exp(np.linspace(-2.5, 2.5, 21)) if centre > 0 else []
-        values = np.unique(np.concatenate([levels[levels > 0], fine]))
-        cells = [jnp.full(len(values) + 1, float(r)) for r in ratios]
-        cells[axis] = jnp.asarray(np.concatenate([[0.0], values]))
-        result = restricted_likelihood(NoiseRatios(*cells), *args)
-        weight = np.exp(result.log_likelihood - result.log_likelihood.max())
-        # Trapezoid in the logarithm of the ratio; "absent" weighs as much as one e-fold.
-        mass = weight * np.concatenate([[1.0], np.gradient(np.log(values))])
-        mass /= mass.sum()
-        cumulative = np.cumsum(mass)
-        white = result.residual_sum / result.degrees_of_freedom
-        coefficient = [
-            noise_coefficients(NoiseRatios(*(c[i] for c in cells)), white[i], record, gain) for i in range(len(mass))
-        ]
-        low, high = np.searchsorted(cumulative, [0.025, 0.975])
-        spans[name] = [coefficient[low][name], coefficient[min(high, len(mass) - 1)][name]]
-        whites += [(coefficient[i]["noise_white"], mass[i]) for i in range(len(mass))]
-    whites.sort()
-    cumulative = np.cumsum([m for _, m in whites]) / sum(m for _, m in whites)
-    scatter = 1.96 / np.sqrt(2 * (record.present.sum() - 1))
-    low, high = (whites[min(int(i), len(whites) - 1)][0] for i in np.searchsorted(cumulative, [0.025, 0.975]))
-    spans["noise_white"] = [low * (1 - scatter), high * (1 + scatter)]
-    return {k: (float(v[0]), float(v[1])) for k, v in spans.items()}
+def _noise_intervals(args, record: Record, gain: float) -> dict[str, tuple[float, float]]:
+    """95 % intervals of the noise coefficients: their ranges over the noise cells that the likelihood ratio does not reject."""
+    cells = noise_grid(int(record.present.sum()), record.interval, record_span(record)).ratios
+    for margin in (4.0, 2.0, 2.0, 2.0, 0.0):
+        result = restricted_likelihood(cells, *args)
+        below = result.log_likelihood.max() - result.log_likelihood
+        kept = below < REJECTED
+        if not margin or kept.sum() > 2 * INTERVAL_LEVELS:
+            break
+        levels = [_levels(np.asarray(ratio), below < margin * REJECTED) for ratio in cells]
+        cells = NoiseRatios(*(jnp.asarray(v.ravel()) for v in np.meshgrid(*levels, indexing="ij")))
+    white = result.residual_sum[kept] / result.degrees_of_freedom
+    ratios = NoiseRatios(cells.flicker[kept], cells.walk[kept])
+    spans = {k: (float(v.min()), float(v.max())) for k, v in noise_coefficients(ratios, white, record, gain).items()}
+    low, high = spans["noise_white"]
+    scatter = 1.96 / float(np.sqrt(2 * (record.present.sum() - 1)))
+    spans["noise_white"] = (low * (1 - scatter), high * (1 + scatter))
+    return spans
+
+
+def _levels(ratio: np.ndarray, likely: np.ndarray) -> np.ndarray:
+    """Levels of one noise ratio, even in amplitude, from the one below its likely range to the one above."""
+    levels = np.unique(ratio)
+    first, last = np.searchsorted(levels, [ratio[likely].min(), ratio[likely].max()])
+    low, high = levels[max(first - 1, 0)], levels[min(last + 1, len(levels) - 1)]
+    return np.linspace(np.sqrt(low), np.sqrt(high), INTERVAL_LEVELS) ** 2

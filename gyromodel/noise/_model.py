@@ -5,7 +5,7 @@ Conventions (two-sided rate PSD): white N², flicker B²/(2πf), random walk K²
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -67,10 +67,10 @@ def _half_on_absent(count: int) -> np.ndarray:
     return np.concatenate([[0.5], np.full(count - 1, 0.5 / (count - 1))])
 
 
-def coefficients(ratios: NoiseRatios, white_variance: float, interval: float) -> dict[str, float]:
-    """N, B and K in internal units (rad/s/√Hz, rad/s, rad/s/√s times the output gain) from ratios and white variance."""
+def coefficients(ratios: NoiseRatios, white_variance: Any, interval: float) -> dict[str, Any]:
+    """N, B and K as input rates (rad/s/√Hz, rad/s, rad/s/√s) from ratios and the white variance of a sample, or arrays of them."""
     return {
-        "noise_white": float(np.sqrt(white_variance * interval)),
-        "noise_flicker": float(np.sqrt(ratios.flicker * white_variance)),
-        "noise_random_walk": float(np.sqrt(ratios.walk * white_variance / interval)),
+        "noise_white": np.sqrt(white_variance * interval),
+        "noise_flicker": np.sqrt(np.asarray(ratios.flicker) * white_variance),
+        "noise_random_walk": np.sqrt(np.asarray(ratios.walk) * white_variance / interval),
     }

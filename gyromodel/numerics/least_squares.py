@@ -1,6 +1,6 @@
 """Scaled Levenberg-Marquardt on accumulated normal equations: the state carries JᵀJ and Jᵀr, never J.
 
-Marquardt's damping in the metric of the columns' norms; a non-finite trial is a rejected one. The loop runs on the host,
+Damping in the metric of the largest column norms met so far; a non-finite trial is a rejected one. The loop runs on the host,
 so that any model is fitted without compiling anything for its structure.
 """
 
@@ -13,6 +13,9 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 Normal = tuple[np.ndarray, np.ndarray, float]
+
+# Damping relative to the squared column norms: what rounding of a singular matrix needs, and what the first refused step gets.
+LEAST_DAMPING, FIRST_DAMPING = 1e-14, 1e-3
 
 
 class Solution(NamedTuple):
@@ -28,40 +31,53 @@ def levenberg_marquardt(
     normal: Callable[[np.ndarray], Normal],
     start: np.ndarray,
     tolerance: float = 1e-10,
-    maximum_iterations: int = 60,
+    maximum_iterations: int = 100,
+    damping: float = LEAST_DAMPING,
 ) -> Solution:
     """Minimise |r(x)|².
 
     Args:
         normal: returns (JᵀJ, Jᵀr, rᵀr) at a point, J the derivative of r.
-        start: where to begin; the first step is a full Gauss-Newton step, exact for a linear problem.
+        start: where to begin.
         tolerance: relative decrease of the cost that still counts.
         maximum_iterations: trials allowed, rejected ones included.
+        damping: of the first step; by default that is a full Gauss-Newton step, exact for a linear problem, and 1e-3 is safer
+            from a far start of a strongly curved one.
     """
     x = np.array(start, float)
     a, g, cost = normal(x)
-    damping = 1e-14
+    if not _finite(a, g, cost):
+        return Solution(x, cost, 0, False)
+    scale, growth = np.zeros(len(x)), 2.0
     for iteration in range(1, maximum_iterations + 1):
-        norm = np.sqrt(np.maximum(np.diag(a), 1e-300))
+        scale = np.maximum(scale, np.sqrt(np.maximum(np.diag(a), 1e-300)))
         try:
-            factor = cho_factor(a / np.outer(norm, norm) + damping * np.eye(len(x)))
-        except (LinAlgError, ValueError):
-            if damping > 1e8 or not np.isfinite(a).all():
-                return Solution(x, cost, iteration, False)
+            factor = cho_factor(a / np.outer(scale, scale) + damping * np.eye(len(x)))
+        except LinAlgError:
             damping = max(8.0 * damping, 1e-8)
             continue
-        step = -cho_solve(factor, g / norm) / norm
+        step = -cho_solve(factor, g / scale) / scale
         promise = -float(g @ step)
         if promise <= tolerance * cost:
-            return Solution(x, cost, iteration, True)
+            # Under heavy damping a small promise says nothing: then the residual must be orthogonal to every column.
+            orthogonal = np.all(np.abs(g) <= 1e-6 * scale * np.sqrt(cost))
+            return Solution(x, cost, iteration, bool(damping < 1.0 or orthogonal))
         a_new, g_new, cost_new = normal(x + step)
-        finite = np.isfinite(cost_new) and np.isfinite(a_new).all() and np.isfinite(g_new).all()
-        if finite and cost_new <= cost:
+        if _finite(a_new, g_new, cost_new) and cost_new <= cost:
             decrease = cost - cost_new
+            # Decrease over what the linear model promised: near one, the damping falls (Nielsen 1999, equation 2.4).
+            ratio = decrease / (promise + damping * float(np.sum((scale * step) ** 2)))
             x, a, g, cost = x + step, a_new, g_new, cost_new
-            damping = max(0.1 * damping, 1e-14)
             if decrease <= tolerance * cost:
                 return Solution(x, cost, iteration, True)
+            damping = max(damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), LEAST_DAMPING)
+            if ratio < 0.25:
+                damping = max(damping, FIRST_DAMPING)
+            growth = 2.0
         else:
-            damping = max(8.0 * damping, 1e-4)
+            damping, growth = max(growth * damping, FIRST_DAMPING), 2.0 * growth
     return Solution(x, cost, maximum_iterations, False)
+
+
+def _finite(a: np.ndarray, g: np.ndarray, cost: float) -> bool:
+    return bool(np.isfinite(cost) and np.isfinite(g).all() and np.isfinite(a).all())

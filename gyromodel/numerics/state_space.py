@@ -65,7 +65,7 @@ def build_filter(noise: MarkovSum, sampling: Sampling) -> Filter:
         covariance = covariance - jnp.outer(gain, cross)
         return covariance, (jnp.where(restart, 0.0, phi), gain, jnp.sqrt(variance))
 
-    _, (transition, gain, scale) = jax.lax.scan(step, prior, sampling._replace())
+    _, (transition, gain, scale) = jax.lax.scan(step, prior, sampling)
     return Filter(transition, gain, scale, sampling.present)
 
 

@@ -82,12 +82,12 @@ def run_engine(built: Built) -> Answer:
     start = time.perf_counter()
     found = gyromodel.diagnose(campaign, model)
     seconds = time.perf_counter() - start
-    driver = tuple(part.strip() for part in found.driver.column.replace(" x ", ",").split(",")) if found.driver else ()
+    driver = tuple(found.driver.column.split(" and ")) if found.driver else ()
     gain = found.gain
     return Answer(
         verdict=found.verdict,
         causes=tuple(c.effect for c in found.causes),
-        first=found.rounds[0].ranking[0].effect if found.rounds and found.rounds[0].ranking else "",
+        first=next((c.effect for c in found.rounds[0].ranking if c.kind == "effect"), "") if found.rounds else "",
         credible=tuple(found.credible_set),
         driver=driver,
         gain_ratio=(gain.ratio, *gain.ci95) if gain else (1.0, 1.0, 1.0),
