@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
@@ -37,8 +36,8 @@ class Slot(NamedTuple):
 class GyroModel(eqx.Module):
     """output = Π gains · (rate + Σ rate terms) · (1 + Σ scale terms) + noise.
 
-    `noise` holds coefficients in internal units by noise id, or is empty for "estimate it"; `fixed` names the parameters
-    that are known, as (effect label, field).
+    `noise` holds coefficients in internal units by noise id, or is empty for "estimate it"; `fixed` names the
+    parameters that are known, as (effect label, field).
     """
 
     effects: tuple[Effect, ...]
@@ -134,7 +133,7 @@ class GyroModel(eqx.Module):
         return gain * rate * scale
 
     def columns_of(self, effect: Effect, signals: Signals) -> Float[Array, "sample coefficient"]:
-        """Derivative of the output by the effect's linear coefficients, were it added to (or as it stands in) this model."""
+        """Derivative of the output by an effect's linear coefficients, as it stands in this model or were it added."""
         gain, rate, scale = self._sites(signals)
         if effect.site == "gain":
             return (rate * scale * gain / effect.value)[:, None]  # type: ignore[attr-defined]
@@ -142,7 +141,7 @@ class GyroModel(eqx.Module):
         return weight[:, None] * effect.columns(signals)
 
     def linearise(self, signals: Signals) -> tuple[Float[Array, " sample"], Float[Array, "sample parameter"]]:
-        """The prediction and its Jacobian by the free parameters: structured columns, one jvp per nonlinear parameter."""
+        """The prediction and its Jacobian by the free parameters: columns, and one jvp per nonlinear parameter."""
         rate = signals.get("rate", jnp.zeros_like(signals["time"]))
         scale = jnp.ones_like(rate)
         pieces = [None if e.site == "gain" else evaluate(e, signals) for e in self.effects]
@@ -161,11 +160,8 @@ class GyroModel(eqx.Module):
                 columns.append((prediction / effect.value)[:, None])  # type: ignore[attr-defined]
                 continue
             linear = effect.declared()[name].linear
-            first = sum(
-                jnp.size(getattr(effect, k))
-                for k, d in itertools.takewhile(lambda kd: kd[0] != name, effect.declared().items())
-                if d.linear == linear
-            )
+            alike = [k for k, declared in effect.declared().items() if declared.linear == linear]
+            first = sum(jnp.size(getattr(effect, k)) for k in alike[: alike.index(name)])
             part = piece[0 if linear else 1][:, first : first + jnp.size(getattr(effect, name))]
             columns.append((by_rate if effect.site == "rate" else by_scale)[:, None] * part)
         return prediction, jnp.concatenate(columns, axis=1) if columns else jnp.zeros((prediction.shape[0], 0))
@@ -216,7 +212,9 @@ def check_units(model: GyroModel, output_unit: str, units: Mapping[str, str]) ->
             continue
         name = next(iter(effect.declared()))
         accepted = [parameter_unit(effect, name, output_unit, units)]
-        what = f"column {effect.column} is in [{units.get(effect.column, '')}]" if isinstance(effect, BiasColumn) else ""
+        what = (
+            f"column {effect.column} is in [{units.get(effect.column, '')}]" if isinstance(effect, BiasColumn) else ""
+        )
         if effect.site == "gain":
             what = f"the output is in [{output_unit}]"
             raw = output_unit.removesuffix("/s")

@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import fields
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import yaml
+from yaml.reader import ReaderError
 
 from gyromodel import __version__
 from gyromodel._atomic import write_text
 from gyromodel.effects import Effect
 from gyromodel.effects.drivers import BiasColumn
 from gyromodel.estimate import Estimate
-from gyromodel.model import GyroModel, ModelError, effect_class, make_effect, parameter_unit
+from gyromodel.model import GyroModel, ModelError, make_effect, parameter_unit
 from gyromodel.noise import NOISE_UNITS
+from gyromodel.signals import Record
 from gyromodel.units import UnitError, convertible, factor, from_internal, internal_unit, quantity, to_internal
 
 # Written into fitted models for the reader; not needed to use them again.
 RECORD_KEYS = ("fit", "software")
+# What a scale factor can be: output per rate; a plain number where the output is itself a rate.
+GAIN_UNITS = ("count/deg", "count/(deg/s)", "bit/deg", "bit/(deg/s)", "V/(deg/s)", "V/deg", "A/(deg/s)", "1/deg", "")
+SETTING_UNITS = {"reference": "degC", "full_rate": "deg/s", "lowest": "deg/s"}
+
+_NUMBER = re.compile(r"\s*[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?")
 
 
 class _Place:
@@ -30,7 +38,7 @@ class _Place:
         self.path, self.node = path, node
 
     def error(self, message: str) -> ModelError:
-        return ModelError(f"{self.path.name}, line {self.node.start_mark.line + 1}: {message}")
+        return _complaint(self.path, self.node.start_mark.line, message)
 
     def mapping(self, allowed: tuple[str, ...], what: str) -> dict[str, _Place]:
         if not isinstance(self.node, yaml.MappingNode):
@@ -38,11 +46,12 @@ class _Place:
         found: dict[str, _Place] = {}
         for key, value in self.node.value:
             place = _Place(self.path, key)
-            if key.value not in allowed:
-                raise place.error(f"unknown key {key.value!r} in {what}; known are {', '.join(allowed)}")
-            if key.value in found:
-                raise place.error(f"{key.value!r} appears twice")
-            found[key.value] = _Place(self.path, value)
+            name = place.text()
+            if name not in allowed:
+                raise place.error(f"unknown key {name!r} in {what}; known are {', '.join(allowed)}")
+            if name in found:
+                raise place.error(f"{name!r} appears twice")
+            found[name] = _Place(self.path, value)
         return found
 
     def items(self, what: str) -> list[_Place]:
@@ -55,22 +64,41 @@ class _Place:
             raise self.error("expected one value")
         return str(self.node.value)
 
-    def number_in(self, unit: str) -> float:
-        """A quantity "12 deg/h" converted to the internal form of `unit`; a bare number counts in `unit` itself."""
+    def quantity(self) -> tuple[float, str]:
+        """A quantity "12 deg/h" in internal units, and the unit text it was written in."""
         text = self.text()
         try:
-            value, written = quantity(text)
-            if written == "" and not convertible("", unit):
-                raise self.error(f"{text!r} needs a unit, for example {text} {unit}")
-            if not convertible(written, unit):
-                raise self.error(f"{text!r} is not a quantity in {unit}")
-            return (
-                float(to_internal(np.asarray(value), written))
-                if unit == "degC"
-                else value * factor(written, internal_unit(unit))
-            )
+            value, unit = quantity(text)
+            if internal_unit(unit) == "degC":
+                value = float(to_internal(np.asarray(value), unit))
+            elif value:
+                value = _rounded_once(text, factor(unit, internal_unit(unit)))
         except UnitError as problem:
             raise self.error(str(problem)) from None
+        if not np.isfinite(value):
+            raise self.error(f"{text!r} is too large")
+        return value, unit
+
+    def number_in(self, *units: str) -> float:
+        """A quantity that must convert to one of some units, in internal units."""
+        value, written = self.quantity()
+        if not any(convertible(written, unit) for unit in units):
+            expected = " or ".join(unit or "a plain number" for unit in units)
+            raise self.error(
+                f"{self.text()!r} is " + (f"not in {expected}" if written else f"without unit: {expected}")
+            )
+        return value
+
+
+def _complaint(path: Path, line: int, message: str) -> ModelError:
+    return ModelError(f"{path.name}, line {line + 1}: {message}")
+
+
+def _rounded_once(text: str, scale: float) -> float:
+    """The number a text begins with, times a scale: rounded once, so that enough digits give any float exactly."""
+    match = _NUMBER.match(text)
+    assert match is not None
+    return float(Decimal(match[0].strip()) * Decimal(scale))
 
 
 def read_model(path: str | Path) -> GyroModel:
@@ -80,25 +108,16 @@ def read_model(path: str | Path) -> GyroModel:
         ModelError: the file is not a model; the message names the line.
     """
     path = Path(path)
-    try:
-        node = yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
-    except FileNotFoundError:
-        raise ModelError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as problem:
-        raise ModelError(f"{path}: cannot be read as text ({problem.__class__.__name__})") from None
-    except yaml.MarkedYAMLError as problem:
-        line = problem.problem_mark.line + 1 if problem.problem_mark else 1
-        raise ModelError(f"{path.name}, line {line}: not valid YAML: {problem.problem}") from None
-    except yaml.YAMLError as problem:
-        raise ModelError(f"{path.name}: not valid YAML: {str(problem).splitlines()[0]}") from None
+    node = _compose(path)
     if node is None:
-        raise ModelError(f"{path.name}: the file is empty; it needs a list of effects")
-    top = _Place(path, node).mapping(("gyro", "effects", "noise", *RECORD_KEYS), "a model")
+        raise _complaint(path, 0, "the file is empty; it needs a list of effects")
+    place = _Place(path, node)
+    top = place.mapping(("gyro", "effects", "noise", *RECORD_KEYS), "a model")
     if "effects" not in top:
-        raise ModelError(f"{path.name}: the model lists no effects")
+        raise place.error("the model lists no effects")
     effects, fixed = [], set()
-    for place in top["effects"].items("effects"):
-        effect, known = _read_effect(place)
+    for item in top["effects"].items("effects"):
+        effect, known = _read_effect(item)
         effects.append(effect)
         fixed |= known
     noise = _read_noise(top["noise"]) if "noise" in top else {}
@@ -109,77 +128,106 @@ def read_model(path: str | Path) -> GyroModel:
         raise top["effects"].error(str(problem)) from None
 
 
+def _compose(path: Path) -> yaml.Node | None:
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise ModelError(f"{path}: no such file") from None
+    except OSError as problem:
+        raise ModelError(f"{path}: cannot be read ({problem.__class__.__name__})") from None
+    try:
+        return yaml.compose(text := data.decode(), Loader=yaml.SafeLoader)
+    except UnicodeDecodeError as problem:
+        raise _complaint(path, data[: problem.start].count(b"\n"), "not a text file in UTF-8") from None
+    except ReaderError as problem:
+        line = text[: int(problem.position)].count("\n")
+        raise _complaint(path, line, f"the character {chr(int(problem.character))!r} is not allowed") from None
+    except yaml.MarkedYAMLError as problem:
+        line = problem.problem_mark.line if problem.problem_mark else 0
+        raise _complaint(path, line, f"not valid YAML: {problem.problem}") from None
+    except (yaml.YAMLError, RecursionError, ValueError, OverflowError) as problem:
+        # PyYAML lets through what Python says of an escape beyond Unicode, or of thousands of nested brackets.
+        raise _complaint(path, 0, f"not valid YAML: {str(problem).splitlines()[0]}") from None
+
+
 def _read_effect(place: _Place) -> tuple[Effect, set[tuple[str, str]]]:
-    keys = {key.value: value for key, value in place.node.value} if isinstance(place.node, yaml.MappingNode) else {}
-    if "effect" not in keys:
+    pairs = place.node.value if isinstance(place.node, yaml.MappingNode) else []
+    named = next((value for key, value in pairs if key.value == "effect"), None)
+    if named is None:
         raise place.error("each entry needs an effect: id")
-    label = _Place(place.path, keys["effect"]).text()
+    named = _Place(place.path, named)
+    label = named.text()
     try:
         effect = make_effect(label)
     except ModelError as problem:
-        raise place.error(str(problem)) from None
-    declared = effect_class(label).declared()
-    settings = [f.name for f in fields(effect) if f.name not in declared and f.name != "column"]
+        raise named.error(str(problem)) from None
+    declared = effect.declared()
+    settings = [f.name for f in fields(effect) if f.name not in (*declared, "column", "unit")]
     found = place.mapping(("effect", "value", "fixed", "std", *declared, *settings), label)
     if "value" in found and len(declared) == 1:
         found[next(iter(declared))] = found.pop("value")
     elif "value" in found:
         raise found["value"].error(f"{label} has several parameters; name them: {', '.join(declared)}")
-    values: dict[str, Any] = {}
+    values: dict[str, Any] = {"column": effect.column} if isinstance(effect, BiasColumn) else {}
     for name in declared:
         if name in found:
-            values[name] = _read_parameter(found[name], effect, name)
+            values |= _read_parameter(found[name], effect, name)
     for name in settings:
         if name in found:
-            values[name] = _read_setting(found[name], name)
-    extra = {"column": effect.column} if isinstance(effect, BiasColumn) else {}
-    effect = type(effect)(**values, **extra)
-    known: set[tuple[str, str]] = set()
-    if "fixed" in found:
-        text = found["fixed"].text().lower()
-        if text not in ("true", "false"):
-            raise found["fixed"].error("fixed is true or false")
-        known = {(label, name) for name in declared} if text == "true" else set()
-        if text == "true" and not all(np.isfinite(np.asarray(getattr(effect, n))).all() for n in declared):
-            raise found["fixed"].error(f"{label} is fixed but has no value")
-    return effect, known
+            values[name] = _read_setting(found[name], effect, name)
+    try:
+        effect = type(effect)(**values)
+    except (TypeError, ValueError) as problem:
+        raise place.error(f"{label}: {str(problem).splitlines()[0]}") from None
+    return effect, _read_fixed(found["fixed"], effect) if "fixed" in found else set()
 
 
-def _read_parameter(place: _Place, effect: Effect, name: str) -> np.ndarray | float:
-    unit = effect.declared()[name].unit
+def _read_fixed(place: _Place, effect: Effect) -> set[tuple[str, str]]:
+    """Which parameters are known: all (true), none (false), or those listed."""
+    declared = effect.declared()
+    if isinstance(place.node, yaml.SequenceNode):
+        names = [item.text() for item in place.items("fixed")]
+    else:
+        names = {"true": list(declared), "false": []}.get(place.text().lower())
+    if names is None or not set(names) <= set(declared):
+        raise place.error(f"fixed is true, false or a list of parameters ({', '.join(declared)})")
+    if not all(np.isfinite(np.asarray(getattr(effect, name))).all() for name in names):
+        raise place.error(f"{effect.label} is fixed but has no value")
+    return {(effect.label, name) for name in names}
+
+
+def _read_parameter(place: _Place, effect: Effect, name: str) -> dict[str, Any]:
+    """A parameter's value, and its unit where that depends on the campaign."""
     if isinstance(place.node, yaml.MappingNode):
-        inner = place.mapping(("value", "std", "unit"), name)
+        inner = place.mapping(("value", "std"), name)
         if "value" not in inner:
             raise place.error(f"{name} has no value")
         place = inner["value"]
-    places = place.items(name) if isinstance(place.node, yaml.SequenceNode) else [place]
-    if effect.site == "gain" or isinstance(effect, BiasColumn):
-        values = [_free_unit(p) for p in places]
-    else:
-        values = [p.number_in(unit) for p in places]
-    return np.array(values) if isinstance(place.node, yaml.SequenceNode) else values[0]
+    if np.ndim(getattr(effect, name)) > 0:
+        places = place.items(name) if isinstance(place.node, yaml.SequenceNode) else [place]
+        return {name: np.array([p.number_in(effect.declared()[name].unit) for p in places])}
+    if effect.site == "gain":
+        value = place.number_in(*GAIN_UNITS)
+        if value == 0:
+            raise place.error("a scale factor cannot be zero")
+        return {name: value, "unit": place.quantity()[1] or "1"}
+    if isinstance(effect, BiasColumn):
+        value, unit = place.quantity()
+        return {name: value, "unit": unit or ("1" if value else "")}
+    return {name: place.number_in(effect.declared()[name].unit)}
 
 
-def _free_unit(place: _Place) -> float:
-    """A quantity whose unit depends on the campaign (output per rate, bias per column), in internal units."""
-    try:
-        value, written = quantity(place.text())
-        return value * factor(written, internal_unit(written))
-    except UnitError as problem:
-        raise place.error(str(problem)) from None
-
-
-def _read_setting(place: _Place, name: str) -> Any:
-    if isinstance(place.node, yaml.SequenceNode):
+def _read_setting(place: _Place, effect: Effect, name: str) -> Any:
+    default = getattr(effect, name)
+    if isinstance(default, tuple | int):
         try:
-            return tuple(int(p.text()) for p in place.items(name))
+            numbers = tuple(int(p.text()) for p in (place.items(name) if isinstance(default, tuple) else [place]))
         except ValueError:
-            raise place.error(f"{name} is a list of whole numbers") from None
-    try:
-        value, written = quantity(place.text())
-        return jnp.asarray(to_internal(np.asarray(value), written))
-    except UnitError as problem:
-        raise place.error(str(problem)) from None
+            raise place.error(f"{name} takes whole numbers") from None
+        if any(abs(n) > 100 for n in numbers):
+            raise place.error(f"{name} takes small whole numbers")
+        return numbers if isinstance(default, tuple) else numbers[0]
+    return place.quantity()[0] if isinstance(effect, BiasColumn) else place.number_in(SETTING_UNITS[name])
 
 
 def _read_noise(place: _Place) -> dict[str, float]:
@@ -195,9 +243,13 @@ def _read_noise(place: _Place) -> dict[str, float]:
         name = entry["effect"].text()
         if name not in NOISE_UNITS:
             raise entry["effect"].error(f"unknown noise {name}; known are {', '.join(NOISE_UNITS)}")
+        if name in noise:
+            raise entry["effect"].error(f"{name} appears twice")
         noise[name] = entry["value"].number_in(NOISE_UNITS[name])
         if noise[name] < 0:
             raise entry["value"].error(f"{name} cannot be negative")
+    if noise.get("noise_white", 0.0) <= 0:
+        raise place.error("a noise list needs a noise_white above zero")
     return noise
 
 
@@ -220,43 +272,27 @@ def _document(model: GyroModel, estimate: Estimate | None) -> dict[str, Any]:
     for i, effect in enumerate(model.effects):
         entry: dict[str, Any] = {"effect": effect.label}
         for name in effect.declared():
-            unit = parameter_unit(
-                effect, name, record.output_unit if record else "rad/s", record.units if record else {}
-            )
             values = np.asarray(getattr(effect, name))
             if not np.isfinite(values).all():
                 continue
-            scale = factor(internal_unit(unit), unit)
-            texts = [_quantity_text(v * scale, unit) for v in np.ravel(values)]
+            unit = _unit_of(effect, name, record)
             errors = [spread.get((i, name, j)) for j in range(values.size)]
-            shown: Any = texts if values.ndim else texts[0]
-            if all(e is not None for e in errors) and errors:
-                stds = [_quantity_text(e * scale, unit) for e in errors if e is not None]
-                shown = {"value": shown, "std": stds if values.ndim else stds[0]}
-            entry[name] = shown
-        for f in fields(effect):
-            value = getattr(effect, f.name)
-            if f.name in effect.declared() or f.name == "column":
-                continue
-            if isinstance(value, tuple):
-                entry[f.name] = list(value)
-            elif np.isfinite(np.asarray(value)).all():
-                entry[f.name] = _setting_text(effect, f.name, float(value), record)
-        if any(label == effect.label for label, _ in model.fixed):
-            entry["fixed"] = True
+            known = [e for e in errors if e is not None]
+            entry[name] = _shown(values, unit)
+            if known and len(known) == len(errors):
+                entry[name] = {"value": entry[name], "std": _shown(np.reshape(known, values.shape), unit)}
+        for name in (f.name for f in fields(effect) if f.name not in (*effect.declared(), "column", "unit")):
+            value = getattr(effect, name)
+            if isinstance(value, tuple | int):
+                entry[name] = list(value) if isinstance(value, tuple) else value
+            elif np.isfinite(float(value)):
+                entry[name] = _exact_text(float(value), _setting_unit(effect, name, record))
+        fixed = [name for name in effect.declared() if (effect.label, name) in model.fixed]
+        if fixed:
+            entry["fixed"] = True if len(fixed) == len(effect.declared()) else fixed
         document["effects"].append(entry)
-    if not model.noise:
-        document["noise"] = "auto"
-    else:
-        document["noise"] = [
-            {
-                "effect": k,
-                "value": _quantity_text(
-                    float(v) * factor(internal_unit(NOISE_UNITS[k]), NOISE_UNITS[k]), NOISE_UNITS[k]
-                ),
-            }
-            for k, v in model.noise.items()
-        ]
+    noise = [{"effect": k, "value": _exact_text(float(v), NOISE_UNITS[k])} for k, v in model.noise.items()]
+    document["noise"] = noise or "auto"
     if estimate and record:
         document["fit"] = _fit_record(estimate)
         document["software"] = f"gyromodel {__version__}"
@@ -267,9 +303,9 @@ def _fit_record(estimate: Estimate) -> dict[str, Any]:
     record, model = estimate.record, estimate.model
     validity = {}
     for name, unit in (("rate", "deg/s"), ("temperature", "degC")):
-        if name in record.signals:
+        if np.isfinite(record.signals.get(name, np.nan)).any():
             values = from_internal(np.asarray(record.signals[name])[: record.rows], unit)
-            validity[name] = [_quantity_text(np.nanmin(values), unit), _quantity_text(np.nanmax(values), unit)]
+            validity[name] = [f"{np.nanmin(values):.10g} {unit}", f"{np.nanmax(values):.10g} {unit}"]
     names = [f"{model.labels[s.effect]}.{s.field}[{s.index}]" for s in model.slots()]
     return {
         "degrees_of_freedom": estimate.degrees_of_freedom,
@@ -283,13 +319,35 @@ def _fit_record(estimate: Estimate) -> dict[str, Any]:
     }
 
 
-def _setting_text(effect: Effect, name: str, value: float, record: Any) -> str:
-    if isinstance(effect, BiasColumn):
-        unit = (record.units.get(effect.column, "") if record else "") or ""
-    else:
-        unit = {"reference": "degC", "full_rate": "deg/s"}[name]
-    return _quantity_text(float(from_internal(np.asarray(value), unit)), unit)
+def _unit_of(effect: Effect, name: str, record: Record | None) -> str:
+    """The unit a parameter is written in; before a fit, one that depends on the campaign is the one it was read in."""
+    if record:
+        return parameter_unit(effect, name, record.output_unit, record.units)
+    if effect.site == "gain" or isinstance(effect, BiasColumn):
+        return getattr(effect, "unit", "")
+    return effect.declared()[name].unit
 
 
-def _quantity_text(value: float, unit: str) -> str:
-    return f"{value:.17g}" if unit in ("", "1") else f"{value:.17g} {unit}"
+def _setting_unit(effect: Effect, name: str, record: Record | None) -> str:
+    if not isinstance(effect, BiasColumn):
+        return SETTING_UNITS[name]
+    unit = record.units.get(effect.column, "") if record else ""
+    return "degC" if internal_unit(unit) == "degC" else unit
+
+
+def _shown(values: np.ndarray, unit: str) -> Any:
+    """A parameter's values, internal, as the file shows them."""
+    texts = [_exact_text(float(v), unit) for v in np.ravel(values)]
+    return texts if np.ndim(values) else texts[0]
+
+
+def _exact_text(value: float, unit: str) -> str | float:
+    """The shortest quantity that reads back as exactly this internal value."""
+    scale = factor(unit, internal_unit(unit))
+    if unit in ("", "1"):
+        return value
+    for digits in (15, 16, 17, 18, 19, 20, 21):
+        text = f"{Decimal(value) / Decimal(scale):.{digits}g}" if digits > 17 else f"{value / scale:.{digits}g}"
+        if _rounded_once(text, scale) == value:
+            break
+    return f"{text} {unit}"

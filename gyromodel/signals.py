@@ -26,8 +26,9 @@ INCREMENT_GAP = 1.5
 class Record(NamedTuple):
     """Signals of one or several campaigns of one unit, laid end to end.
 
-    `output` is a rate-type output (increments divided by their interval, angles differenced); `rows` is the number of real
-    rows before padding; `interval` the nominal sample interval (s); `units` the file's units by column; `blocks` numbers the stretches that replicate one another.
+    `output` is a rate-type output (increments divided by their interval, angles differenced); `rows` is the number of
+    real rows before padding; `interval` the nominal sample interval (s); `units` the file's units by column; `blocks`
+    numbers the stretches that replicate one another.
     """
 
     signals: dict[str, Float[Array, " sample"]]
@@ -82,7 +83,7 @@ def _stretches(time: np.ndarray) -> np.ndarray:
 
 
 def _blocks(campaign: Campaign, time: np.ndarray) -> tuple[np.ndarray, str]:
-    """Stretches that replicate the driver: runs between gaps, else the segment or run column, else equal parts in time."""
+    """Stretches that replicate the driver: runs between gaps, else the segment or run column, else equal parts."""
     stretches = _stretches(time)
     if 4 <= stretches.max() + 1 <= 60:
         return stretches, "stretches between gaps"

@@ -1,5 +1,5 @@
-"""The Levenberg-Marquardt driver against the certified values of NIST's nonlinear reference problems (itl.nist.gov/div898/strd),
-and against closed forms where a problem misbehaves."""
+"""The Levenberg-Marquardt driver against the certified values of NIST's nonlinear reference problems
+(itl.nist.gov/div898/strd), and against closed forms where a problem misbehaves."""
 
 from __future__ import annotations
 

@@ -14,6 +14,15 @@ from gyromodel.diagnosis._result import (
 )
 
 __all__ = [
-    "SAFE_THRESHOLD", "Candidate", "Cause", "Confuser", "Diagnosis", "Driver", "Gain", "ParameterValue", "Round", "Verdict",
+    "SAFE_THRESHOLD",
+    "Candidate",
+    "Cause",
+    "Confuser",
+    "Diagnosis",
+    "Driver",
+    "Gain",
+    "ParameterValue",
+    "Round",
+    "Verdict",
     "diagnose",
-]  # fmt: skip
+]

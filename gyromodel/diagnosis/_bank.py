@@ -1,4 +1,4 @@
-"""Everything the search tries on a campaign, as columns: catalogue effects in all their forms, and smooth unknown drivers."""
+"""All that the search tries on a campaign, as columns: catalogue effects in every form, and smooth unknown drivers."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def build_bank(record: Record, included: Iterable[str] = ()) -> Bank:
     scans = []
     rate = np.asarray(signals.get("rate", jnp.zeros_like(signals["time"])))
     for name, kind in sorted(CATALOGUE.items()):
-        if name == "bias_column" or kind.site == "gain" and "rate" not in signals:
+        if name == "bias_column" or (kind.site == "gain" and "rate" not in signals):
             if name != "bias_column":
                 not_testable[name] = "needs a column rate"
             continue
@@ -80,7 +80,7 @@ def build_bank(record: Record, included: Iterable[str] = ()) -> Bank:
             forms = kind.candidates(signals)
             if not forms:
                 not_testable[name] = "its driver does not vary"
-            blocks += [(name, "effect", _weighted(e, signals, rate), e) for e in forms]
+            blocks.extend((name, "effect", _weighted(e, signals, rate), e) for e in forms)
     plain = [n for n in driver_names(record) if n not in ("rate", "temperature")]
     for name in plain:
         effect = BiasColumn(column=name).prepared(signals)

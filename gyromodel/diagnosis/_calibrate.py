@@ -40,7 +40,7 @@ def null_scores(
         cells, columns, data.T, lambda k: say("calibrating the threshold", 0.06 + 0.18 * k / len(cells))
     )
     likelihood = np.stack([results[g][0] + scanner.grid.log_prior[g] for g in cells])
-    null = logsumexp(likelihood, axis=0)
+    null = np.asarray(logsumexp(likelihood, axis=0))
     names = [n for n in results[cells[0]][1] if n not in skip]
     scores = [logsumexp(likelihood + np.stack([results[g][1][n] for g in cells]), axis=0) - null for n in names]
     return np.max(scores, axis=0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import jax.numpy as jnp
 import numpy as np
 
 from gyromodel.campaign import Campaign
@@ -71,7 +72,8 @@ def diagnose(
     Args:
         campaigns: measured data of one unit; long ones are averaged first, and the findings say so.
         model: what the simulation contains.
-        hold_out: whether to repeat the search without each block for the gain on data not seen; the slower half of the work.
+        hold_out: whether to repeat the search without each block for the gain on data not seen; half of the work
+            or more.
         calibrate: draws of simulated data with nothing hidden that set the threshold; 0 takes the safe threshold.
         seed: of those draws.
         progress: called with a line and the fraction done.
@@ -86,7 +88,8 @@ def diagnose(
     if any(m > 1 for _, m in shortened):
         most = max(m for _, m in shortened)
         findings.append(
-            f"Means of {most} consecutive samples were searched: lines above their sample rate and quantisation are averaged away."
+            f"Means of {most} consecutive samples were searched: lines above their sample rate and quantisation are "
+            "averaged away."
         )
     record = read_signals([c for c, _ in shortened])
     say("fitting the simulation", 0.02)
@@ -117,7 +120,8 @@ def diagnose(
     ordinary = tuple(hold_out and session.ladder(e)[2] for e in (baseline, selection.estimate))
     if ordinary[1]:
         findings.append(
-            "Parameters weigh all samples alike: that predicts left-out blocks better than the fitted noise's weights do."
+            "Parameters weigh all samples alike: that predicts left-out blocks better than the fitted noise's weights "
+            "do."
         )
     final = selection.estimate
     extended = fit_record(final.record, final.model_as_given(), intervals=True, ordinary=ordinary[1])
@@ -158,7 +162,7 @@ def _grid(record: Record, baseline: Estimate) -> NoiseGrid:
     """Noise cells to sum over: all of the family, or the one the model states."""
     span = record_span(record)
     if baseline.noise_given:
-        ratios = type(baseline.ratios)(*(np.atleast_1d(r) for r in baseline.ratios))
+        ratios = type(baseline.ratios)(*(jnp.atleast_1d(r) for r in baseline.ratios))
         return NoiseGrid(ratios, np.zeros(1), record.interval, max(span, 2 * record.interval))
     return noise_grid(int(record.present.sum()), record.interval, span)
 

@@ -1,12 +1,15 @@
 """Evidence ratios of added columns, and what they sum to over shapes, sizes and noise.
 
-Prior on the added coefficients: N(0, t²σ²(AᵀA)⁻¹), σ profiled out, averaged over t² (so that small and large effects are
-ranked alike) and over the candidate's shapes (which is the price of the search).
+Prior on the added coefficients: N(0, t²σ²(AᵀA)⁻¹), σ profiled out, averaged over t² (so that small and large effects
+are ranked alike) and over the candidate's shapes (which is the price of the search).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+from scipy.special import logsumexp
 
 SIZES = np.array([1e1, 1e2, 1e3, 1e4])
 
@@ -31,6 +34,11 @@ def explained_for(log_ratio: float, nu: int, q: int) -> float:
         else:
             high = middle
     return high
+
+
+def log_sum(values: np.ndarray | Sequence[float]) -> float:
+    """ln of the sum of exponentials."""
+    return float(np.asarray(logsumexp(values)))
 
 
 def log_mean(values: np.ndarray) -> float:

@@ -12,7 +12,6 @@ from gyromodel.diagnosis._result import Gain
 from gyromodel.estimate import Estimate, EstimateError, filter_of, fit_record, whiten_columns
 from gyromodel.signals import Record
 
-
 # Ordinary weights replace the noise model's where they lower the held-out rms to less than this part.
 ORDINARY_MARGIN = 0.9
 
@@ -25,7 +24,7 @@ def blocks_of(record: Record) -> list[np.ndarray]:
 
 
 def held_out(record: Record, train: Estimate, rows: np.ndarray) -> tuple[np.ndarray, float]:
-    """Errors of a block (as a rate) by a model fitted without it, and its log score conditional on the other blocks' noise."""
+    """Errors of a block (as a rate) by a model fitted without it, and its log score given the other blocks' noise."""
     predicted = np.asarray(train.model.predict(record.signals))
     gain = float(train.model.gain())
     residual = np.asarray(record.signals["output"]) - predicted
@@ -50,7 +49,8 @@ def ladder_error(record: Record, estimate: Estimate) -> tuple[float, float, bool
     """Held-out error of one model structure, refitted without each block.
 
     Returns:
-        rms (rad/s), log score, and whether ordinary least squares left the smaller rms (by more than chance would at 5 %).
+        rms (rad/s), log score, and whether ordinary least squares left the smaller rms (by more than chance would at
+        5 %).
     """
     errors: dict[bool, list[np.ndarray]] = {False: [], True: []}
     score = 0.0
@@ -137,7 +137,7 @@ def _summary(before, after, scores, scheme: str, unit: str, scale: float) -> Gai
     # Jackknife over blocks for the ratio, Student's t over blocks for the log score.
     logs = np.array([0.5 * np.log(np.delete(before, k).mean() / np.delete(after, k).mean()) for k in range(folds)])
     spread = np.sqrt((folds - 1) / folds * np.sum((logs - logs.mean()) ** 2))
-    t = stats.t.ppf(0.975, folds - 1)
+    t = float(stats.t.ppf(0.975, folds - 1))
     total, error = float(scores.sum()), float(np.sqrt(folds) * scores.std(ddof=1))
     interval = (float(ratio * np.exp(-t * spread)), float(ratio * np.exp(t * spread)))
     return Gain(

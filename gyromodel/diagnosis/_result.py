@@ -34,7 +34,7 @@ class Confuser:
 
 @dataclass(frozen=True)
 class Cause:
-    """A discrepancy's cause: its evidence (ln of the evidence ratio), its parameters and what it could be mistaken for."""
+    """A discrepancy's cause: its evidence (ln of the evidence ratio), parameters, and what it could be mistaken for."""
 
     effect: str
     parameters: tuple[ParameterValue, ...]
@@ -69,7 +69,7 @@ class Round:
 
 @dataclass(frozen=True)
 class Gain:
-    """Held-out error before and after the extension, selection repeated without each fold (`ratio` above 1 is better)."""
+    """Held-out error before and after the extension, selection repeated without each fold; `ratio` above 1 is better."""
 
     before: float
     after: float

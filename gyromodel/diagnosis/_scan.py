@@ -1,8 +1,8 @@
-"""One pass of the search: the evidence of every candidate in every noise cell, given the baseline's Jacobian and residual.
+"""One pass of the search: evidence of every candidate in every noise cell, from the baseline's Jacobian and residual.
 
-Per cell, the candidates' own energies CᵀV⁻¹C are computed once; each round then needs only V⁻¹ applied to the baseline's
-columns and residual, and inner products with raw columns. Steps and pulses at every epoch and lines at every frequency
-use cumulative sums and Fourier transforms of V⁻¹r instead of columns.
+Per cell, the candidates' own energies CᵀV⁻¹C are computed once; each round then needs only V⁻¹ applied to the
+baseline's columns and residual, and inner products with raw columns. Steps and pulses at every epoch and lines at every
+frequency use cumulative sums and Fourier transforms of V⁻¹r instead of columns.
 """
 
 from __future__ import annotations
@@ -10,15 +10,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cache
+from typing import cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.fft
-from scipy.special import gammaln, logsumexp
+from scipy.special import gammaln
+from threadpoolctl import ThreadpoolController
 
 from gyromodel.diagnosis._bank import Bank
-from gyromodel.diagnosis._evidence import log_evidence_ratio, log_mean
+from gyromodel.diagnosis._evidence import log_evidence_ratio, log_mean, log_sum
 from gyromodel.estimate import make_filter, whiten_columns
 from gyromodel.model import record_span
 from gyromodel.noise import NoiseGrid, NoiseRatios
@@ -27,8 +30,8 @@ from gyromodel.signals import Record
 
 # A candidate whose columns keep less than this share of their energy beside the baseline cannot be tested.
 VANISHED = 1e-6
-# A line's energy is computed exactly at the lowest frequencies, at log-spaced ones to interpolate between, and at the leading
-# peaks of each pass, whose correction holds for their neighbours too.
+# A line's energy is computed exactly at the lowest frequencies, at log-spaced ones to interpolate between, and at the
+# leading peaks of each pass, whose correction holds for their neighbours too.
 LOWEST_LINES, SPACED_LINES, PEAKS, PEAK_WIDTH = 24, 40, 12, 6
 COLUMN_STEP = 16
 THREADS = 2
@@ -36,6 +39,11 @@ THREADS = 2
 TEST_POINTS = 40
 
 _energies = jax.jit(step_and_pulse_energy)
+
+
+@cache
+def _libraries() -> ThreadpoolController:
+    return ThreadpoolController()
 
 
 @jax.jit
@@ -62,7 +70,8 @@ def line_grid(record: Record) -> LineGrid:
     if np.abs(time[: record.rows] / grid - np.round(time[: record.rows] / grid)).max() > 0.1:
         grid /= 4.0
     grid = max(grid, span / 2**18)
-    length = scipy.fft.next_fast_len(int(np.ceil(4.0 * (span + grid) / grid)), real=True)
+    # scipy declares no return type here.
+    length = cast(int, scipy.fft.next_fast_len(int(np.ceil(4.0 * (span + grid) / grid)), real=True))
     frequencies = np.arange(1, length // 2 + 1) / (length * grid)
     frequencies = frequencies[frequencies < 0.5 / record.interval * (1 - 0.5 / record.rows)]
     exact = np.arange(min(LOWEST_LINES, len(frequencies)))
@@ -192,7 +201,8 @@ class Scanner:
         stacked = np.column_stack([jacobian, residual])
         pad = -stacked.shape[1] % COLUMN_STEP
         data = jnp.asarray(np.pad(np.where(self.present[:, None], stacked, 0.0), ((0, 0), (0, pad))))
-        with ThreadPoolExecutor(THREADS) as pool:
+        # Cells share the cores; BLAS threads on top of them would only wait for one another.
+        with _libraries().limit(limits=1, user_api="blas"), ThreadPoolExecutor(THREADS) as pool:
             results = list(pool.map(lambda g: self._run_cell(g, data, jacobian.shape[1]), cells))
         return dict(zip(cells, results, strict=True))
 
@@ -273,7 +283,7 @@ class Scanner:
         self._record(result, name, where, t, np.where(keep, left, 0.0), 1, nu)
 
     def _test_points(self, result, cell: Cell, zj: np.ndarray, zy: np.ndarray, rows: np.ndarray, nu: int) -> None:
-        """Sets of anomalous points, of any size up to a third: ordered by a robust fit, priced by how many sets there are."""
+        """Sets of anomalous points, up to a third of all: ordered by a robust fit, priced by how many sets there are."""
         identity = jnp.zeros((len(self.present), len(rows))).at[rows, np.arange(len(rows))].set(1.0)
         precision = np.asarray(_precision(cell.filter, identity))[rows]
         left = precision - zj @ zj.T
@@ -289,7 +299,7 @@ class Scanner:
             ratios.append(float(log_evidence_ratio(np.array(min(t, result.rss)), result.rss, nu, m)) - price)
             sets.append((rows[chosen], t))
         top = int(np.argmax(ratios))
-        result.evidence["outliers"] = float(logsumexp(ratios))
+        result.evidence["outliers"] = log_sum(ratios)
         result.best["outliers"] = (tuple(int(r) for r in sets[top][0]), sets[top][1], float(top + 1))
         result.energy["outliers"] = np.diag(left)
 
@@ -299,7 +309,7 @@ class Scanner:
         count = len(grid.frequencies)
         spread = np.zeros((grid.length, zj.shape[1] + 1))
         np.add.at(spread, grid.index, np.column_stack([zj, zy]))
-        spectrum = scipy.fft.rfft(spread, axis=0)[1 : count + 1]
+        spectrum = np.asarray(scipy.fft.rfft(spread, axis=0))[1 : count + 1]
         c, s = spectrum.real, -spectrum.imag
         a11 = cell.line[:, 0, 0] - np.sum(c[:, :-1] ** 2, axis=1)
         a22 = cell.line[:, 1, 1] - np.sum(s[:, :-1] ** 2, axis=1)
@@ -328,7 +338,6 @@ class Scanner:
             right = float(cross[:, -1] @ np.linalg.solve(a, cross[:, -1])) if sound else 0.0
             around = slice(max(k - PEAK_WIDTH, 0), k + PEAK_WIDTH + 1)
             t[around] = np.minimum(t[around] * (right / t[k] if t[k] > 0 else 0.0), right)
-
 
     def _record(self, result, name: str, where: np.ndarray, t: np.ndarray, energy: np.ndarray, q: int, nu: int) -> None:
         if not len(where):

@@ -1,4 +1,4 @@
-"""Rounds of the search: rank all candidates, add the best, refit, re-choose the earlier ones, stop when nothing is left."""
+"""Rounds of the search: rank all candidates, add the best, refit, choose the earlier ones again, until none is left."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.special import logsumexp
 
+from gyromodel.diagnosis._evidence import log_sum
 from gyromodel.diagnosis._scan import CellResult, Scanner
 from gyromodel.effects import Effect
 from gyromodel.effects.drivers import BiasPeriodic, BiasStep
@@ -78,7 +78,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Selection:
-    """Where the rounds ended: the extended fit, what was added, and the ranking in which nothing more was significant."""
+    """Where the rounds ended: the extended fit, what was added, and the ranking in which no more was significant."""
 
     estimate: Estimate
     found: tuple[Found, ...]
@@ -106,12 +106,12 @@ def rank(scanner: Scanner, cells: list[int], estimate: Estimate, pulses: tuple[i
     results = scanner.run(cells, columns, residual, contained)
     prior = scanner.grid.log_prior
     logs = np.array([results[g].log_likelihood + prior[g] for g in cells])
-    null = float(logsumexp(logs))
+    null = log_sum(logs)
     statistic = {}
     for name in sorted({n for r in results.values() for n in r.evidence} - skip):
         each = [results[g].evidence.get(name, -np.inf) for g in cells]
-        statistic[name] = float(logsumexp(logs + np.array(each)) - null)
-    total = logsumexp(list(statistic.values())) if statistic else 0.0
+        statistic[name] = log_sum(logs + np.array(each)) - null
+    total = log_sum(list(statistic.values())) if statistic else 0.0
     posterior = {k: float(np.exp(v - total)) for k, v in statistic.items()}
     walk, flicker = scanner.grid.ratios.walk, scanner.grid.ratios.flicker
     slow = {g: float(walk[g]) > 0 or float(flicker[g]) > 0 for g in cells}
@@ -119,7 +119,7 @@ def rank(scanner: Scanner, cells: list[int], estimate: Estimate, pulses: tuple[i
 
 
 def rank_where_it_matters(scanner: Scanner, estimate: Estimate, pulses: tuple[int, ...]) -> Ranking:
-    """Rank over the noise cells that matter: every other level, then the neighbours of those with weight for a candidate."""
+    """Rank over the noise cells that matter: every other level, then neighbours of those with weight for a candidate."""
     skip = skipped(estimate.model)
     if scanner.only_cells is not None:
         return rank(scanner, scanner.only_cells, estimate, pulses, skip)
@@ -219,10 +219,10 @@ def form_effect(scanner: Scanner, name: str, form: int) -> Effect | None:
     """The effect behind a form number."""
     if name == "bias_step":
         time = np.asarray(scanner.record.signals["time"])
-        return BiasStep(epoch=float(time[form] + time[form - 1]) / 2)
+        return BiasStep(epoch=jnp.asarray(float(time[form] + time[form - 1]) / 2))
     if name == "bias_periodic":
         assert scanner.lines is not None
-        return BiasPeriodic(frequency=float(scanner.lines.frequencies[form]))
+        return BiasPeriodic(frequency=jnp.asarray(float(scanner.lines.frequencies[form])))
     return scanner.bank.blocks[form].effect
 
 
@@ -245,7 +245,7 @@ def _solved(scanner: Scanner, estimate: Estimate, effect: Effect, g: int, pulses
 
 
 def refit(record: Record, baseline: Estimate, found: list[Found]) -> Estimate | None:
-    """Fit the baseline with everything found; where a shape parameter cannot be estimated it is held at the searched value."""
+    """Fit the baseline with everything found; a shape parameter that cannot be estimated is held at its searched value."""
     model = baseline.model
     given = baseline.noise_given
     for step in found:

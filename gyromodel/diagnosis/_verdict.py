@@ -42,7 +42,7 @@ class Judgement:
 
 
 def credible(ranking: Ranking, name: str, statistic: float, *, runs: int) -> dict[str, float]:
-    """The smallest set of names that holds 95 % of the posterior, for the cause found as `name`; forms of one family merged."""
+    """The smallest set of names with 95 % of the posterior, for the cause found as `name`; forms of one family merged."""
     own = {k: v for k, v in ranking.statistic.items() if not is_driver(k) and (k != "outliers" or name == "outliers")}
     if name in SLOW_IN_TIME and runs < 2 and statistic < TIME_MARGIN and _coloured(ranking):
         own["noise_random_walk"] = max(0.0, statistic - 1.0)
@@ -124,7 +124,8 @@ def judge(
         if len(members) > 1:
             others = " or ".join(members)
             findings.append(
-                f"The extended model also holds {cause.effect}, which this campaign cannot tell from the others of: {others}."
+                f"The extended model also holds {cause.effect}, which this campaign cannot tell from the others of: "
+                f"{others}."
             )
     return Judgement("named", named, sets[0], None, None, unexplained, tuple(findings))
 
@@ -159,8 +160,8 @@ def _next_test(names: list[str], record: Record, cause: Cause) -> str:
         rate = np.asarray(record.signals["rate"])[list(cause.points)] * factor("rad/s", "deg/s")
         levels = ", ".join(f"{r:.4g}" for r in sorted(rate))
         return (
-            f"Repeat the points at {levels} deg/s several times, in both directions and in random order: anomalous test points "
-            "do not come back, a curve does."
+            f"Repeat the points at {levels} deg/s several times, in both directions and in random order: anomalous test "
+            "points do not come back, a curve does."
         )
     if "noise_random_walk" in names:
         return "Repeat the run: a deterministic change comes back the same, a random walk does not."
@@ -198,7 +199,7 @@ def _cause(
         parameters = tuple(
             ParameterValue(r.name, r.value, r.std, r.unit)
             for r in estimate.table()
-            if r.effect == name and r.std > 0 or r.effect == name
+            if r.effect == name
         )
     return Cause(name, parameters, statistic, p, adjusted, members.get(name, 0.0), confusers, tuple(step.rows))
 
@@ -236,7 +237,7 @@ def _columns(scanner: Scanner, ranking: Ranking, name: str) -> np.ndarray | None
 
 
 def _separation(scanner: Scanner, ranking: Ranking, a: str, b: str) -> float | None:
-    """Sine of the smallest principal angle between two candidates' whitened, projected columns, in the noise of the first."""
+    """Sine of the smallest principal angle between two candidates' whitened, projected columns, in the first's noise."""
     first, second = _columns(scanner, ranking, a), _columns(scanner, ranking, b)
     if first is None or second is None:
         return None
@@ -284,7 +285,7 @@ def _remaining(scanner: Scanner, baseline: Estimate, selection: Selection) -> tu
 
 
 def driver_shape(scanner: Scanner, selection: Selection, name: str, unit: str) -> Driver:
-    """The smooth function behind an unknown discrepancy, at the measured points in order of its first column, with its band."""
+    """The smooth function behind an unknown discrepancy, at the measured points sorted by its first column, with band."""
     ranking = selection.last
     columns = _columns(scanner, ranking, name)
     assert columns is not None

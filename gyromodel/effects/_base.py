@@ -43,6 +43,11 @@ def parameter(unit: str, typical: float, meaning: str, *, linear: bool = True, d
     )
 
 
+def setting() -> Any:
+    """Declare a field that shapes the columns and is not fitted; NaN until the campaign or the model file sets it."""
+    return eqx.field(converter=lambda v: jnp.asarray(v, float), default_factory=lambda: jnp.nan)
+
+
 CATALOGUE: dict[str, type[Effect]] = {}
 
 
@@ -50,8 +55,9 @@ class Effect(eqx.Module):
     """One additive term of the gyro model.
 
     `site` says where it acts in output = gain · (rate + Σ rate terms) · (1 + Σ scale terms). Fields declared with
-    `parameter` are its parameters. `columns` returns one column per linear coefficient, in field order, and may depend on
-    the nonlinear ones; the contribution is columns @ coefficients, so zero coefficients are exactly the model without it.
+    `parameter` are its parameters. `columns` returns one column per linear coefficient, in field order, and may depend
+    on the nonlinear ones; the contribution is columns @ coefficients, so zero coefficients are exactly the model
+    without it.
     `supersedes` lists effects that this one contains as a special case; `held` the fields that physics
     or the search fixes; `positive` says that the (only) coefficient cannot be negative; `scan` names a fast search over
     every epoch or frequency.
@@ -92,7 +98,7 @@ class Effect(eqx.Module):
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
-        """The forms the search tries, at zero amplitude: every variant, every grid point of the nonlinear parameters."""
+        """The forms the search tries, at zero amplitude: every variant, every grid point of nonlinear parameters."""
         return [cls().prepared(signals)]
 
     @classmethod
@@ -140,10 +146,9 @@ def evaluate(
             continue
         value = getattr(effect, name)
 
-        def moved(v, name=name):
-            return eqx.tree_at(lambda e: getattr(e, name), effect, jnp.reshape(v, jnp.shape(value))).contribution(
-                signals
-            )
+        def moved(v, name=name, value=value):
+            changed = eqx.tree_at(lambda e: getattr(e, name), effect, jnp.reshape(v, jnp.shape(value)))
+            return changed.contribution(signals)
 
         for direction in jnp.eye(jnp.size(value)):
             derivatives.append(jax.jvp(moved, (jnp.ravel(value),), (direction,))[1])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -30,14 +31,14 @@ def check_curve(coefficients: Array, hinges: Array, breakpoints: Array) -> None:
         raise ValueError("a curve needs a coefficient or a hinge")
 
 
-def curve_forms(x: Float[Array, " sample"]) -> list[dict[str, np.ndarray]]:
+def curve_forms(x: Float[Array, " sample"]) -> list[dict[str, Any]]:
     """Zero-amplitude forms of a curve: quadratic, cubic, a line with one hinge, a line with two."""
     low, high = float(jnp.nanmin(x)), float(jnp.nanmax(x))
     if not high > low:
         return []
     one = np.linspace(low, high, 13)[1:-1]
     two = list(itertools.combinations(np.linspace(low, high, 8)[1:-1], 2))
-    forms = [{"coefficients": np.zeros(order)} for order in (2, 3)]
+    forms: list[dict[str, Any]] = [{"coefficients": np.zeros(order)} for order in (2, 3)]
     for breaks in [(b,) for b in one] + two:
         forms.append({"coefficients": np.zeros(1), "hinges": np.zeros(len(breaks)), "breakpoints": np.array(breaks)})
     return forms

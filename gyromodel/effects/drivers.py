@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from gyromodel.effects._base import Effect, Signals, parameter, stack
+from gyromodel.effects._base import Effect, Signals, parameter, setting, stack
 
 
 class Bias(Effect):
@@ -108,7 +108,7 @@ class BiasColumn(Effect):
     coefficient: Float[Array, ""] = parameter("deg/h", 1.0, "bias per unit of the column, in the column's unit")
     column: str = eqx.field(static=True, default="")
     unit: str = eqx.field(static=True, default="")
-    reference: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(jnp.nan), converter=jnp.asarray)
+    reference: Float[Array, ""] = setting()
 
     @property
     def label(self) -> str:

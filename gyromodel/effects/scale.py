@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from gyromodel.effects._base import Effect, Signals, parameter, round_reference, stack
+from gyromodel.effects._base import Effect, Signals, parameter, round_reference, setting, stack
 from gyromodel.effects._shapes import check_curve, curve_columns, curve_forms
 
 
@@ -39,7 +39,7 @@ class ScaleFactor(Effect):
         centred = rate[good] - rate[good].mean()
         energy = float(centred @ centred)
         slope = float(centred @ output[good]) / energy if energy > 0 else 1.0
-        return type(self)(value=slope if slope != 0 else 1.0, unit=self.unit)
+        return eqx.tree_at(lambda e: e.value, self, jnp.asarray(slope if slope != 0 else 1.0))
 
 
 class ScaleAsymmetry(Effect):
@@ -71,7 +71,7 @@ class ScaleNonlinearity(Effect):
         "ppm", 100.0, "each power's part of the output at full_rate, of it", default=()
     )
     powers: tuple[int, ...] = eqx.field(static=True, default=(2, 3, 4, 5))
-    full_rate: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(jnp.nan), converter=jnp.asarray)
+    full_rate: Float[Array, ""] = setting()
 
     def __post_init__(self) -> None:
         if np.size(self.coefficients) == 0:
@@ -130,7 +130,7 @@ class ScaleSagnacSine(Effect):
     def settled(self) -> Self:
         """Full sine, with the κ that has the same cubic term."""
         kappa = self.kappa * jnp.sqrt(jnp.maximum(self.share, 1e-6))
-        return type(self)(share=1.0, kappa=kappa)
+        return type(self)(share=jnp.ones(()), kappa=kappa)
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
@@ -149,7 +149,7 @@ class ScaleTemperature(Effect):
     test = "Positive and negative rates at each temperature: a bias over temperature does not change sign."
 
     coefficient: Float[Array, ""] = parameter("ppm/degC", 10.0, "relative change per degree")
-    reference: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(jnp.nan), converter=jnp.asarray)
+    reference: Float[Array, ""] = setting()
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """T − T0."""
@@ -175,7 +175,7 @@ class ScaleTemperatureCurve(Effect):
     coefficients: Float[Array, " order"] = parameter("ppm", 100.0, "power i: part per (10 °C)^i", default=(0.0, 0.0))
     hinges: Float[Array, " hinge"] = parameter("ppm/degC", 10.0, "change of slope at each breakpoint", default=())
     breakpoints: Float[Array, " hinge"] = parameter("degC", 10.0, "where the slope changes", linear=False, default=())
-    reference: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(jnp.nan), converter=jnp.asarray)
+    reference: Float[Array, ""] = setting()
 
     def __check_init__(self) -> None:
         check_curve(self.coefficients, self.hinges, self.breakpoints)
@@ -204,13 +204,15 @@ class ScaleSpline(Effect):
     site = "rate"
     needs = ("rate",)
     cause = "The input-output curve bends in a way that no low power of the rate describes."
-    test = "Repeat the rates in both directions and random order: anomalous test points and resonances do not come back alike."
+    test = (
+        "Repeat the rates both ways and in random order: anomalous test points and resonances do not come back alike."
+    )
     supersedes = ("scale_nonlinearity",)
 
     coefficients: Float[Array, " bend"] = parameter("ppm", 100.0, "bends, as parts of the largest rate", default=())
     knots: int = eqx.field(static=True, default=6)
-    full_rate: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(jnp.nan), converter=jnp.asarray)
-    lowest: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(jnp.nan), converter=jnp.asarray)
+    full_rate: Float[Array, ""] = setting()
+    lowest: Float[Array, ""] = setting()
 
     def __post_init__(self) -> None:
         if np.size(self.coefficients) == 0:
@@ -223,7 +225,8 @@ class ScaleSpline(Effect):
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """Truncated cubes that are straight outside the outer knots, less their tangent at rest.
 
-        Knots are even from `lowest` to `full_rate`; with value and slope zero at rest, bias and scale factor keep their meaning.
+        Knots are even from `lowest` to `full_rate`; with value and slope zero at rest, bias and scale factor keep their
+        meaning.
         """
         places = jnp.linspace(0.0, 1.0, self.knots)
         width = self.full_rate - self.lowest
@@ -236,14 +239,15 @@ class ScaleSpline(Effect):
         rest = -self.lowest / width
         value, slope = jax.jvp(bends, (rest,), (jnp.ones(()),))
         rate = signals["rate"]
-        return (bends((rate - self.lowest) / width) - value - slope * rate[:, None] / width) * self.full_rate
+        top = jnp.maximum(jnp.abs(self.full_rate), jnp.abs(self.lowest))
+        return (bends((rate - self.lowest) / width) - value - slope * rate[:, None] / width) * top
 
     def prepared(self, signals: Signals) -> Self:
         """Spread the knots over the campaign's rates."""
-        if np.isfinite(float(self.full_rate)):
+        if np.isfinite(float(self.full_rate)) and np.isfinite(float(self.lowest)):
             return self
-        ends = jnp.max(signals["rate"]), jnp.min(signals["rate"])
-        return eqx.tree_at(lambda e: (e.full_rate, e.lowest), self, ends)
+        low, high = jnp.nanmin(signals["rate"]), jnp.nanmax(signals["rate"])
+        return eqx.tree_at(lambda e: (e.full_rate, e.lowest), self, (jnp.where(high > low, high, low + 1.0), low))
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from gyromodel.effects._base import Effect, Signals, parameter, round_reference, stack
+from gyromodel.effects._base import Effect, Signals, parameter, round_reference, setting, stack
 from gyromodel.effects._shapes import check_curve, curve_columns, curve_forms
 
 
@@ -23,7 +23,7 @@ class BiasTemperature(Effect):
     test = "Heat and then cool: a drift in time does not come back."
 
     coefficient: Float[Array, ""] = parameter("deg/h/degC", 1.0, "bias change per degree")
-    reference: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(jnp.nan), converter=jnp.asarray)
+    reference: Float[Array, ""] = setting()
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """T − T0."""
@@ -49,7 +49,7 @@ class BiasTemperatureCurve(Effect):
     coefficients: Float[Array, " order"] = parameter("deg/h", 1.0, "power i: bias per (10 °C)^i", default=(0.0, 0.0))
     hinges: Float[Array, " hinge"] = parameter("deg/h/degC", 1.0, "change of slope at each breakpoint", default=())
     breakpoints: Float[Array, " hinge"] = parameter("degC", 10.0, "where the slope changes", linear=False, default=())
-    reference: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(jnp.nan), converter=jnp.asarray)
+    reference: Float[Array, ""] = setting()
 
     def __check_init__(self) -> None:
         check_curve(self.coefficients, self.hinges, self.breakpoints)

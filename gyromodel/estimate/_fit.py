@@ -15,7 +15,7 @@ from gyromodel.estimate._optimistix import optimistix_solution
 from gyromodel.model import GyroModel, ModelError, check_units, record_span
 from gyromodel.noise import NoiseRatios, markov_sum, noise_grid, restricted_likelihood
 from gyromodel.numerics.least_squares import Normal, Solution, levenberg_marquardt
-from gyromodel.numerics.state_space import Filter, build_filter, colour, whiten
+from gyromodel.numerics.state_space import Filter, build_filter, colour, whiten, whitened_gram
 from gyromodel.signals import Record, read_signals
 
 Solver = Literal["levenberg_marquardt", "optimistix"]
@@ -75,7 +75,7 @@ def fit_record(
         solver: see `fit`.
         intervals: whether to find the noise coefficients' intervals.
         ordinary: weigh all samples alike in the parameters (the noise is still estimated, and so is the covariance that
-            ordinary least squares has under it): less efficient where the noise model is right, and safer where it is not.
+            ordinary least squares has under it): less efficient where the noise model is right, safer where it is not.
     """
     if not jnp.zeros(()).dtype == jnp.float64:
         raise EstimateError("JAX runs in single precision; import gyromodel before using jax, or set JAX_ENABLE_X64=1")
@@ -147,10 +147,7 @@ def filter_of(record: Record, ratios: NoiseRatios) -> Filter:
 whiten_columns = jax.jit(whiten)
 
 
-@jax.jit
-def _gram(filter: Filter, columns):
-    w = whiten(filter, columns)
-    return w.T @ w
+_gram = jax.jit(whitened_gram)
 
 
 def solve(model: GyroModel, x: np.ndarray, record: Record, ratios: NoiseRatios, solver: Solver) -> Solution:
@@ -180,7 +177,7 @@ def pad_columns(columns, step: int = 8):
 
 
 def best_ratios(record: Record, model: GyroModel, *, coarse: bool, start: NoiseRatios) -> NoiseRatios:
-    """Flicker and walk of greatest restricted likelihood: the whole grid, then ever finer squares around the best cell."""
+    """Flicker and walk of greatest restricted likelihood: the grid, then ever finer squares around the best cell."""
     predicted, jacobian = model.linearise(record.signals)
     residual = jnp.where(record.sampling.present, record.signals["output"] - predicted, 0.0)
     span = record_span(record)
@@ -273,8 +270,9 @@ def unit_covariance(whitened_jacobian: np.ndarray, model: GyroModel) -> np.ndarr
     weak = directions[singular < SINGULAR * singular[0]]
     if len(weak):
         involved = sorted({model.labels[slots[i].effect] for d in weak for i in np.flatnonzero(np.abs(d) > 0.1)})
+        names = " and ".join(involved)
         raise EstimateError(
-            f"{' and '.join(involved)} cannot be told apart on this campaign: fix all but one, or measure where they differ"
+            f"{names} cannot be told apart on this campaign: fix all but one, or measure where they differ"
         )
     inverse = np.linalg.inv(r)
     return (inverse @ inverse.T) / np.outer(norm, norm)
@@ -298,7 +296,7 @@ def _coloured_transposed(filter: Filter, columns):
 
 
 def _noise_intervals(args, record: Record, gain: float) -> dict[str, tuple[float, float]]:
-    """95 % intervals of the noise coefficients: their ranges over the noise cells that the likelihood ratio does not reject."""
+    """95 % intervals of the noise coefficients: their ranges over the cells that a likelihood ratio does not reject."""
     cells = noise_grid(int(record.present.sum()), record.interval, record_span(record)).ratios
     for margin in (4.0, 2.0, 2.0, 2.0, 0.0):
         result = restricted_likelihood(cells, *args)

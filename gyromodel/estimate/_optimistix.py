@@ -1,4 +1,4 @@
-"""optimistix as second solver: the same whitened residual, its Levenberg-Marquardt with an SVD for rank-deficient starts."""
+"""optimistix as second solver: the same whitened residual, its Levenberg-Marquardt with an SVD for any rank."""
 
 from __future__ import annotations
 

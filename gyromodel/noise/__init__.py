@@ -1,7 +1,7 @@
 """Noise as part of the model: white, flicker and random walk as state-space blocks, and their restricted likelihood."""
 
-from gyromodel.noise._model import NOISE_UNITS, NoiseGrid, NoiseRatios, coefficients, markov_sum, noise_grid
 from gyromodel.noise._likelihood import CellFit, restricted_likelihood
+from gyromodel.noise._model import NOISE_UNITS, NoiseGrid, NoiseRatios, coefficients, markov_sum, noise_grid
 
 __all__ = [
     "NOISE_UNITS",

@@ -1,6 +1,7 @@
 """White noise, flicker and random walk relative to the white variance.
 
-Conventions (two-sided rate PSD): white N², flicker B²/(2πf), random walk K²/(2πf)²; Allan variances N²/τ, (2 ln2/π)B², K²τ/3.
+Conventions, two-sided rate PSD and Allan variance: white N² and N²/τ, flicker B²/(2πf) and (2 ln2/π)B², random walk
+K²/(2πf)² and K²τ/3.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ def _half_on_absent(count: int) -> np.ndarray:
 
 
 def coefficients(ratios: NoiseRatios, white_variance: Any, interval: float) -> dict[str, Any]:
-    """N, B and K as input rates (rad/s/√Hz, rad/s, rad/s/√s) from ratios and the white variance of a sample, or arrays of them."""
+    """N, B, K as input rates (rad/s/√Hz, rad/s, rad/s/√s) from ratios and white variances of a sample."""
     return {
         "noise_white": np.sqrt(white_variance * interval),
         "noise_flicker": np.sqrt(np.asarray(ratios.flicker) * white_variance),

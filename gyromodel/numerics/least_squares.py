@@ -1,7 +1,7 @@
 """Scaled Levenberg-Marquardt on accumulated normal equations: the state carries JᵀJ and Jᵀr, never J.
 
-Damping in the metric of the largest column norms met so far; a non-finite trial is a rejected one. The loop runs on the host,
-so that any model is fitted without compiling anything for its structure.
+Damping in the metric of the largest column norms met so far; a non-finite trial is a rejected one. The loop runs on
+the host, so that any model is fitted without compiling anything for its structure.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 Normal = tuple[np.ndarray, np.ndarray, float]
 
-# Damping relative to the squared column norms: what rounding of a singular matrix needs, and what the first refused step gets.
+# Damping relative to the squared column norms: what a singular matrix needs, and what the first refused step gets.
 LEAST_DAMPING, FIRST_DAMPING = 1e-14, 1e-3
 
 
@@ -41,8 +41,8 @@ def levenberg_marquardt(
         start: where to begin.
         tolerance: relative decrease of the cost that still counts.
         maximum_iterations: trials allowed, rejected ones included.
-        damping: of the first step; by default that is a full Gauss-Newton step, exact for a linear problem, and 1e-3 is safer
-            from a far start of a strongly curved one.
+        damping: of the first step; by default that is a full Gauss-Newton step, exact for a linear problem, and 1e-3 is
+            safer from a far start of a strongly curved one.
     """
     x = np.array(start, float)
     a, g, cost = normal(x)

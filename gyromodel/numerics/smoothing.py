@@ -1,4 +1,4 @@
-"""Derivative of a noisy, unevenly sampled record by a cubic smoothing spline (smoothness by generalised cross-validation)."""
+"""Derivative of a noisy, unevenly sampled record by a cubic smoothing spline, its smoothness by cross-validation."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import numpy as np
 from scipy.interpolate import make_smoothing_spline
 
 # More knots than this cost time and resolve nothing of a thermal record.
-MAXIMUM_KNOTS = 2000
+MAXIMUM_KNOTS = 400
 
 
 def smooth_derivative(time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """d(values)/d(time) of the smoothed record; long records are averaged to at most 2 000 points first."""
+    """d(values)/d(time) of the smoothed record; long records are averaged to at most 400 points first."""
     n = len(time)
     if n < 6 or np.ptp(values) == 0:
         return np.gradient(values, time) if n > 1 else np.zeros(n)

@@ -1,8 +1,8 @@
-"""Linear-Gaussian filter for a signal in white noise plus a sum of scalar Markov processes: whitening and likelihood in O(n).
+"""Whitening and likelihood in O(n) of a signal in white noise plus a sum of scalar Markov processes.
 
-The observation at time t is the sum of all states plus white noise; each state decays at its own rate (rate zero: a random
-walk). Samples may be unequally spaced or missing, and independent records may follow one another. The filter is the
-Cholesky factor of the noise covariance, V = L Lᵀ, applied without ever forming V.
+The observation at time t is the sum of all states plus white noise; each state decays at its own rate (rate zero: a
+random walk). Samples may be unequally spaced or missing, and independent records may follow one another. The filter is
+the Cholesky factor of the noise covariance, V = L Lᵀ, applied without ever forming V.
 """
 
 from __future__ import annotations
@@ -13,12 +13,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+# Rows whitened at a time for a Gram matrix: they stay in cache, and the products are large enough to be fast.
+GRAM_ROWS = 256
+# Fewer rows than this are as fast in one piece, and compile sooner.
+SHORT = 2048
+
 
 class Sampling(NamedTuple):
     """When the samples were taken and how far each can be trusted.
 
-    `interval[t]` is the time since the previous sample (s); `restart[t]` opens an independent record; `present[t]` is False
-    for a missing sample; `white[t]` is the white variance relative to the unit of the noise model.
+    `interval[t]` is the time since the previous sample (s); `restart[t]` opens an independent record; `present[t]` is
+    False for a missing sample; `white[t]` is the white variance relative to the unit of the noise model.
     """
 
     interval: Float[Array, " sample"]
@@ -28,14 +33,14 @@ class Sampling(NamedTuple):
 
 
 class MarkovSum(NamedTuple):
-    """Sum of Markov processes: decay rates (1/s) and, where decaying, the stationary variance, else variance per second."""
+    """Sum of Markov processes: decay rates (1/s); stationary variances, for a decay of zero variance per second."""
 
     decay: Float[Array, " state"]
     variance: Float[Array, " state"]
 
 
 class Filter(NamedTuple):
-    """Everything the whitening recursions need: per-sample transition and gain, and the innovation's standard deviation."""
+    """What the whitening recursions need: transition and gain per sample, and the innovation's standard deviation."""
 
     transition: Float[Array, "sample state"]
     gain: Float[Array, "sample state"]
@@ -71,6 +76,29 @@ def build_filter(noise: MarkovSum, sampling: Sampling) -> Filter:
 
 def whiten(filter: Filter, columns: Float[Array, "sample column"]) -> Float[Array, "sample column"]:
     """L⁻¹ applied to columns; rows of missing samples come out zero."""
+    return _whiten_on(jnp.zeros((filter.gain.shape[1], columns.shape[1])), filter, columns)[1]
+
+
+def whitened_gram(filter: Filter, columns: Float[Array, "sample column"]) -> Float[Array, "column column"]:
+    """XᵀV⁻¹X of columns X; on long records a few rows at a time, so that the whitened columns are never stored."""
+    rows, width = columns.shape
+    if rows < SHORT:
+        w = whiten(filter, columns)
+        return w.T @ w
+
+    def add(start, length, state, gram):
+        here, part = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, length), (filter, columns))
+        state, w = _whiten_on(state, here, part)
+        return state, gram + w.T @ w
+
+    last = rows % GRAM_ROWS
+    carry = jnp.zeros((filter.gain.shape[1], width)), jnp.zeros((width, width))
+    carry = jax.lax.fori_loop(0, rows // GRAM_ROWS, lambda i, c: add(i * GRAM_ROWS, GRAM_ROWS, *c), carry)
+    return add(rows - last, last, *carry)[1] if last else carry[1]
+
+
+def _whiten_on(state, filter: Filter, columns):
+    """Whitened rows that follow on `state`, and the state after them."""
 
     def step(state, inputs):
         transition, gain, scale, present, row = inputs
@@ -78,9 +106,8 @@ def whiten(filter: Filter, columns: Float[Array, "sample column"]) -> Float[Arra
         innovation = jnp.where(present, row - state.sum(0), 0.0)
         return state + gain[:, None] * innovation, innovation / scale
 
-    start = jnp.zeros((filter.gain.shape[1], columns.shape[1]))
     rows = jnp.where(filter.present[:, None], columns, 0.0)
-    return jax.lax.scan(step, start, (*filter, rows))[1]
+    return jax.lax.scan(step, state, (*filter, rows))
 
 
 def colour(filter: Filter, draws: Float[Array, " sample"]) -> Float[Array, " sample"]:
@@ -97,7 +124,7 @@ def colour(filter: Filter, draws: Float[Array, " sample"]) -> Float[Array, " sam
 
 
 def whiten_transposed(filter: Filter, columns: Float[Array, "sample column"]) -> Float[Array, "sample column"]:
-    """L⁻ᵀ applied to columns, so that V⁻¹x = whiten_transposed(whiten(x))."""
+    """L⁻ᵀ applied to columns; after `whiten` it makes V⁻¹x."""
 
     def step(adjoint, inputs):
         transition, gain, scale, present, row = inputs
@@ -109,7 +136,7 @@ def whiten_transposed(filter: Filter, columns: Float[Array, "sample column"]) ->
 
 
 def step_and_pulse_energy(filter: Filter) -> tuple[Float[Array, " sample"], Float[Array, " sample"]]:
-    """Squared norms of a whitened unit step from each sample on, and of a whitened unit pulse at each sample, in one pass."""
+    """Squared norms of a whitened unit step from each sample on, and of a whitened unit pulse at each, in one pass."""
     states = filter.gain.shape[1]
     zero, one = jnp.zeros(1), jnp.ones(1)
 

@@ -11,6 +11,7 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gyromodel._atomic import write_text
 from gyromodel.report._numbers import count, number, pair, percent, unit_text, with_uncertainty
 from gyromodel.report._sentence import confused, kinds, sentence
 from gyromodel.report._words import driver_name, listed, phrase, spoken, title
@@ -48,8 +49,11 @@ def write_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> list[P
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     written = []
     for figure in drawn.all():
-        written.append(_replace(folder / "figures" / f"{figure.name}.svg", figure.svg))
-    return [_replace(folder / "report.html", page), *written]
+        path = folder / "figures" / f"{figure.name}.svg"
+        write_text(path, figure.svg)
+        written.append(path)
+    write_text(folder / "report.html", page)
+    return [folder / "report.html", *written]
 
 
 def rendered(diagnosis: Diagnosis, drawn: Any) -> str:
@@ -364,14 +368,3 @@ def _version() -> str:
         return version("gyromodel")
     except PackageNotFoundError:
         return ""
-
-
-def _replace(path: Path, text: str) -> Path:
-    """Write a text file so that no reader ever sees half of it."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
-    return path
