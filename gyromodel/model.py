@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -263,9 +264,13 @@ def draw_noise(model: GyroModel, record: Record, rng: np.random.Generator) -> np
     )
     draws = jnp.asarray(rng.standard_normal(len(record.sampling.present)))
     sampling = record.sampling._replace(present=jnp.ones_like(record.sampling.present))
-    filter = build_filter(markov_sum(ratios, record.interval, record_span(record)), sampling)
-    noise = colour(filter, draws)
+    noise = _realise(ratios, record.interval, record_span(record), sampling, draws)
     return np.asarray(noise)[: record.rows] * np.sqrt(variance) * abs(float(model.gain()))
+
+
+@jax.jit
+def _realise(ratios: NoiseRatios, interval, span, sampling, draws):
+    return colour(build_filter(markov_sum(ratios, interval, span), sampling), draws)
 
 
 def record_span(record: Record) -> float:

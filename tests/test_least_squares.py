@@ -89,7 +89,9 @@ class Problem(NamedTuple):
 @lru_cache
 def load(folder: Path, name: str) -> Problem:
     text = (folder / f"{name}.dat").read_text(encoding="ascii")
-    rows = np.array([re.findall(r"[-+.\dEe]+", line.split("=")[1]) for line in re.findall(r"(?m)^ *b\d+ *=.*$", text)], float)
+    rows = np.array(
+        [re.findall(r"[-+.\dEe]+", line.split("=")[1]) for line in re.findall(r"(?m)^ *b\d+ *=.*$", text)], float
+    )
     data = np.array([line.split() for line in text[text.rindex("Data:") :].splitlines()[1:] if line.strip()], float)
     y = np.log(data[:, 0]) if name == "Nelson" else data[:, 0]
     x = data[:, 1:].T if name == "Nelson" else data[:, 1]
@@ -116,7 +118,9 @@ def right_digits(found: np.ndarray, certified: np.ndarray) -> float:
 
 
 def solve(problem: Problem, start: int, **options: float) -> Solution:
-    return levenberg_marquardt(problem.normal, problem.starts[start], tolerance=1e-14, maximum_iterations=1000, **options)
+    return levenberg_marquardt(
+        problem.normal, problem.starts[start], tolerance=1e-14, maximum_iterations=1000, **options
+    )
 
 
 def test_every_problem_of_the_collection_is_here(measured_data):

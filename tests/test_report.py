@@ -7,6 +7,7 @@ tables are checked for what they must contain, on made-up diagnoses of every ver
 from __future__ import annotations
 
 import math
+import os
 import re
 import subprocess
 import sys
@@ -532,7 +533,7 @@ def test_a_failed_write_leaves_the_old_report(
     def fail(*_: Any) -> None:
         raise OSError("disk full")
 
-    monkeypatch.setattr(Path, "replace", fail)
+    monkeypatch.setattr(os, "replace", fail)
     with pytest.raises(OSError, match="disk full"):
         write_report(replace(diagnosis, next_test="other"), tmp_path)
     assert report.read_bytes() == before

@@ -96,7 +96,8 @@ def test_filter_is_the_dense_cholesky_factor(kind: str, rng: np.random.Generator
         case = draw(rng, kind)
         columns, draws = rng.standard_normal((ROWS, 3)), rng.standard_normal(ROWS)
         white, transposed, coloured, log_determinant, (steps, pulses) = (
-            jax.tree.map(np.asarray, x) for x in run(case.noise, case.sampling, jnp.asarray(columns), jnp.asarray(draws))
+            jax.tree.map(np.asarray, x)
+            for x in run(case.noise, case.sampling, jnp.asarray(columns), jnp.asarray(draws))
         )
         here = case.present
         lower = case.factor

@@ -14,7 +14,7 @@ from gyromodel.diagnosis._calibrate import null_scores
 from gyromodel.diagnosis._gain import ladder_error, nested_gain, no_gain, not_measured
 from gyromodel.diagnosis._result import Candidate, Diagnosis, Gain, Round
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._search import Found, Progress, Ranking, Selection, cells_of_weight, is_driver, search
+from gyromodel.diagnosis._search import Found, Progress, Ranking, Selection, cells_of_weight, is_driver, search, standing
 from gyromodel.diagnosis._variance import growing_noise, tails, with_variance
 from gyromodel.diagnosis._verdict import driver_shape, judge, minimum_detectable, testable
 from gyromodel.estimate import Estimate, fit_record
@@ -52,9 +52,10 @@ class _Session:
         selection = self.run(baseline, progress)
         for i in range(2, len(selection.estimates)):
             now, before = self.ladder(selection.estimates[i]), self.ladder(selection.estimates[i - 1])
-            if selection.found[i - 1].effect is not None and now[0] > before[0] and now[1] < before[1]:
-                found, estimates = selection.found[: i - 1], selection.estimates[:i]
-                return Selection(estimates[-1], found, selection.found[i - 1].ranking, estimates, None)
+            if selection.path[i - 1].effect is not None and now[0] > before[0] and now[1] < before[1]:
+                path, estimates = selection.path[: i - 1], selection.estimates[:i]
+                last = selection.path[i - 1].ranking
+                return Selection(estimates[-1], tuple(standing(path)), path, last, estimates, selection.driver)
         return selection
 
 
@@ -179,7 +180,7 @@ def _gain(session: _Session, baseline: Estimate, selection: Selection, unit: str
     if not any(f.effect is not None for f in selection.found):
         return no_gain(session.record, baseline, unit, scale)
 
-    rankings = [f.ranking for f in selection.found] + [selection.last]
+    rankings = [f.ranking for f in selection.path] + [selection.last]
     cells = sorted({g for ranking in rankings for g in cells_of_weight(ranking, FOLD_NEARBY)})
 
     def select(record: Record, base: Estimate) -> Estimate:
@@ -200,7 +201,7 @@ def _gain(session: _Session, baseline: Estimate, selection: Selection, unit: str
 
 def _rounds(session: _Session, selection: Selection, scale: float, hold_out: bool) -> tuple[Round, ...]:
     steps: list[tuple[Found | None, Ranking, Estimate]] = [
-        (f, f.ranking, e) for f, e in zip(selection.found, selection.estimates[1:], strict=False)
+        (f, f.ranking, e) for f, e in zip(selection.path, selection.estimates[1:], strict=False)
     ]
     rounds = []
     unknown = (np.nan, np.nan, False)
@@ -209,7 +210,7 @@ def _rounds(session: _Session, selection: Selection, scale: float, hold_out: boo
         Round(
             None,
             0.0,
-            _ranking(selection.found[0].ranking if selection.found else selection.last),
+            _ranking(selection.path[0].ranking if selection.path else selection.last),
             before[0] * scale,
             before[1],
         )

@@ -41,7 +41,7 @@ def log_sum(values: np.ndarray | Sequence[float]) -> float:
     return float(np.asarray(logsumexp(values)))
 
 
-def log_mean(values: np.ndarray) -> float:
-    """ln of the mean of exponentials."""
-    top = float(values.max())
-    return top + float(np.log(np.mean(np.exp(values - top))))
+def log_mean(values: np.ndarray) -> np.ndarray:
+    """ln of the mean of exponentials over the first axis."""
+    top = values.max(axis=0)
+    return top + np.log(np.mean(np.exp(values - top), axis=0))

@@ -69,7 +69,7 @@ class Round:
 
 @dataclass(frozen=True)
 class Gain:
-    """Held-out error before and after the extension, selection repeated without each fold; `ratio` above 1 is better."""
+    """Held-out error before and after the extension, selected anew without each fold; `ratio` above 1 is better."""
 
     before: float
     after: float

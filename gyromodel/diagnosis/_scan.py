@@ -21,7 +21,7 @@ from scipy.special import gammaln
 from threadpoolctl import ThreadpoolController
 
 from gyromodel.diagnosis._bank import Bank
-from gyromodel.diagnosis._evidence import log_evidence_ratio, log_mean, log_sum
+from gyromodel.diagnosis._evidence import log_evidence_ratio, log_mean
 from gyromodel.estimate import make_filter, whiten_columns
 from gyromodel.model import record_span
 from gyromodel.noise import NoiseGrid, NoiseRatios
@@ -34,6 +34,8 @@ VANISHED = 1e-6
 # leading peaks of each pass, whose correction holds for their neighbours too.
 LOWEST_LINES, SPACED_LINES, PEAKS, PEAK_WIDTH = 24, 40, 12, 6
 COLUMN_STEP = 16
+# Fewer cycles in the record than this are a trend, not a line.
+FEWEST_CYCLES = 1.5
 THREADS = 2
 # Records this short are test points, each of which may be anomalous; longer ones are series with single gross errors.
 TEST_POINTS = 40
@@ -53,11 +55,12 @@ def _precision(filter: Filter, columns):
 
 @dataclass
 class LineGrid:
-    """Frequencies searched for lines (Hz) and the Fourier grid that serves them."""
+    """Frequencies searched for lines (Hz) and the Fourier grid that serves them, from its bin number `first` on."""
 
     frequencies: np.ndarray
     index: np.ndarray
     length: int
+    first: int
     exact: np.ndarray
     basis: np.ndarray = field(repr=False)
 
@@ -72,14 +75,15 @@ def line_grid(record: Record) -> LineGrid:
     grid = max(grid, span / 2**18)
     # scipy declares no return type here.
     length = cast(int, scipy.fft.next_fast_len(int(np.ceil(4.0 * (span + grid) / grid)), real=True))
-    frequencies = np.arange(1, length // 2 + 1) / (length * grid)
+    first = int(np.ceil(FEWEST_CYCLES / span * length * grid))
+    frequencies = np.arange(first, length // 2 + 1) / (length * grid)
     frequencies = frequencies[frequencies < 0.5 / record.interval * (1 - 0.5 / record.rows)]
     exact = np.arange(min(LOWEST_LINES, len(frequencies)))
     spaced = np.geomspace(len(exact) + 1, len(frequencies), SPACED_LINES).round().astype(int) - 1
     exact = np.unique(np.concatenate([exact, np.clip(spaced, 0, len(frequencies) - 1)]))
     phase = 2.0 * np.pi * time[:, None] * frequencies[exact]
     index = np.minimum(np.round(time / grid).astype(int), length - 1)
-    return LineGrid(frequencies, index, length, exact, np.concatenate([np.cos(phase), np.sin(phase)], axis=1))
+    return LineGrid(frequencies, index, length, first, exact, np.concatenate([np.cos(phase), np.sin(phase)], axis=1))
 
 
 @dataclass
@@ -103,6 +107,26 @@ class CellResult:
     evidence: dict[str, float]
     best: dict[str, tuple[int | tuple[int, ...], float, float]]
     energy: dict[str, np.ndarray]
+
+
+@dataclass
+class Batch:
+    """A cell's results for several residuals: arrays have one entry a residual; `energy` is theirs in common."""
+
+    log_likelihood: np.ndarray
+    rss: np.ndarray
+    evidence: dict[str, np.ndarray]
+    best: dict[str, tuple[list, np.ndarray, np.ndarray]]
+    energy: dict[str, np.ndarray]
+
+    def first(self) -> CellResult:
+        """The first residual's results as plain numbers."""
+        best = {
+            name: (form[0] if isinstance(form[0], tuple) else int(form[0]), float(t[0]), float(q[0]))
+            for name, (form, t, q) in self.best.items()
+        }
+        evidence = {name: float(v[0]) for name, v in self.evidence.items()}
+        return CellResult(float(self.log_likelihood[0]), float(self.rss[0]), evidence, best, self.energy)
 
 
 class Scanner:
@@ -195,132 +219,142 @@ class Scanner:
             residual: measured minus predicted, as a rate.
             contained: how many of a candidate's columns the baseline already has, by name.
         """
+        batches = self.run_many(cells, jacobian, residual[:, None], contained)
+        return {g: batch.first() for g, batch in zip(cells, batches, strict=True)}
+
+    def run_many(
+        self, cells: Sequence[int], jacobian: np.ndarray, residuals: np.ndarray, contained: dict[str, int]
+    ) -> list[Batch]:
+        """As `run`, for many residuals of one baseline at once (one a column); cells in the order given."""
         spare = np.array([contained.get(b.name, 0) for b in self.bank.blocks])
         drivers = np.array([b.kind == "driver" for b in self.bank.blocks], bool)
-        self._least = np.where(drivers, 1, np.maximum(self._widths - spare, 1))
-        stacked = np.column_stack([jacobian, residual])
+        least = np.where(drivers, 1, np.maximum(self._widths - spare, 1))
+        stacked = np.column_stack([jacobian, residuals])
         pad = -stacked.shape[1] % COLUMN_STEP
         data = jnp.asarray(np.pad(np.where(self.present[:, None], stacked, 0.0), ((0, 0), (0, pad))))
         # Cells share the cores; BLAS threads on top of them would only wait for one another.
         with _libraries().limit(limits=1, user_api="blas"), ThreadPoolExecutor(THREADS) as pool:
-            results = list(pool.map(lambda g: self._run_cell(g, data, jacobian.shape[1]), cells))
-        return dict(zip(cells, results, strict=True))
+            return list(pool.map(lambda g: self._run_cell(g, data, jacobian.shape[1], stacked.shape[1], least), cells))
 
     @property
     def degrees_of_freedom(self) -> int:
         """Samples present."""
         return int(self.present.sum())
 
-    def _run_cell(self, g: int, data: jax.Array, p: int) -> CellResult:
+    def _run_cell(self, g: int, data: jax.Array, p: int, columns: int, least: np.ndarray) -> Batch:
         cell = self.cell(g)
-        z = np.asarray(_precision(cell.filter, data))[:, : p + 1]
-        x = np.asarray(data)[:, : p + 1]
-        gram = x.T @ z
-        norm = np.sqrt(np.maximum(np.diag(gram)[:p], 1e-300))
-        scaled = gram[:p, :p] / np.outer(norm, norm) + 1e-13 * np.eye(p)
+        z = np.asarray(_precision(cell.filter, data))[:, :columns]
+        x = np.asarray(data)[:, :columns]
+        against = x[:, :p].T @ z
+        norm = np.sqrt(np.maximum(np.diag(against)[:p], 1e-300))
+        scaled = against[:, :p] / np.outer(norm, norm) + 1e-13 * np.eye(p)
         root = np.linalg.inv(np.linalg.cholesky(scaled)) / norm
-        jy = root @ gram[:p, p]
-        rss = max(float(gram[p, p] - jy @ jy), 1e-300)
+        jy = root @ against[:, p:]
+        rss = np.maximum(np.sum(x[:, p:] * z[:, p:], axis=0) - np.sum(jy**2, axis=0), 1e-300)
         nu = int(self.present.sum()) - p
         log_j = 2.0 * np.log(norm).sum() + np.linalg.slogdet(scaled)[1]
-        likelihood = -0.5 * cell.log_determinant - 0.5 * log_j - 0.5 * nu * np.log(rss)
-        result = CellResult(likelihood, rss, {}, {}, {})
+        batch = Batch(-0.5 * cell.log_determinant - 0.5 * log_j - 0.5 * nu * np.log(rss), rss, {}, {}, {})
         zj = z[:, :p] @ root.T
-        zy = z[:, p] - zj @ jy
-        self._blocks(result, cell, zj, zy, nu)
+        zy = z[:, p:] - zj @ jy
+        self._blocks(batch, cell, zj, zy, nu, least)
         rows = self.epochs
         if self.steps:
             sj, sy = (np.cumsum(v[::-1], axis=0)[::-1][rows] for v in (zj, zy))
-            self._single(result, "bias_step", rows, sy, cell.step[rows], sj, nu)
+            self._single(batch, "bias_step", rows, sy, cell.step[rows], sj, nu)
         if self.outliers:
             rows = np.flatnonzero(self.present[: self.record.rows])
             if self.by_points:
-                self._test_points(result, cell, zj[rows], zy[rows], rows, nu)
+                self._test_points(batch, cell, zj[rows], zy[rows], rows, nu)
             else:
-                self._single(result, "outliers", rows, zy[rows], cell.pulse[rows], zj[rows], nu)
+                self._single(batch, "outliers", rows, zy[rows], cell.pulse[rows], zj[rows], nu)
         if self.lines:
-            self._lines(result, cell, zj, zy, nu)
-        return result
+            self._lines(batch, cell, zj, zy, nu)
+        return batch
 
-    def _blocks(self, result: CellResult, cell: Cell, zj: np.ndarray, zy: np.ndarray, nu: int) -> None:
+    def _blocks(
+        self, batch: Batch, cell: Cell, zj: np.ndarray, zy: np.ndarray, nu: int, least: np.ndarray
+    ) -> None:
         cross = self.bank.columns.T @ zj
         against = self.bank.columns.T @ zy
-        count_all = len(self.bank.blocks)
-        t_of, q_of, energy = np.zeros(count_all), np.zeros(count_all), np.zeros(count_all)
+        blocks, draws = len(self.bank.blocks), zy.shape[1]
+        t_of, q_of, energy = np.zeros((blocks, draws)), np.zeros(blocks), np.zeros(blocks)
         for q, (first, count, start) in self._layout.items():
             own = cell.blocks[q]
             c = cross[start : start + q * count].reshape(count, q, -1)
-            b = against[start : start + q * count].reshape(count, q)
+            b = against[start : start + q * count].reshape(count, q, draws)
             norm = np.sqrt(np.maximum(np.einsum("bii->bi", own), 1e-300))
             a = (own - c @ c.transpose(0, 2, 1)) / (norm[:, :, None] * norm[:, None, :])
             values, vectors = np.linalg.eigh(a)
             keep = values > VANISHED
-            along = np.einsum("bij,bi->bj", vectors, b / norm)
-            t = np.sum(np.where(keep, along**2 / np.where(keep, values, 1.0), 0.0), axis=1)
+            along = vectors.transpose(0, 2, 1) @ (b / norm[:, :, None])
+            t = np.sum(np.where(keep, 1.0 / np.where(keep, values, 1.0), 0.0)[:, :, None] * along**2, axis=1)
             here = slice(first, first + count)
-            t_of[here] = np.where(self._positive[here] & (b[:, 0] < 0), 0.0, t)
+            t_of[here] = np.where(self._positive[here, None] & (b[:, 0] < 0), 0.0, t)
             q_of[here] = keep.sum(1)
             energy[here] = np.sum(values * keep, axis=1) / np.maximum(q_of[here], 1) * np.mean(norm**2, axis=1)
         # A form that loses more columns than the baseline contains is another form in disguise.
-        ratio = np.where(q_of >= self._least, log_evidence_ratio(t_of, result.rss, nu, q_of), -np.inf)
+        sound = q_of >= least
+        ratio = log_evidence_ratio(t_of, batch.rss, nu, q_of[:, None])
         for name, structures in self._members.items():
-            result.energy[name] = energy[np.concatenate(structures)]
+            batch.energy[name] = energy[np.concatenate(structures)]
             # Structures compete by their mean over shapes; the best shape of the best structure stands for the name.
-            sound = [mine[np.isfinite(ratio[mine])] for mine in structures if np.isfinite(ratio[mine]).any()]
-            if sound:
-                means = np.array([log_mean(ratio[mine]) for mine in sound])
-                winner = sound[int(np.argmax(means))]
-                top = int(winner[np.argmax(ratio[winner])])
-                result.evidence[name] = float(log_mean(means))
-                result.best[name] = (top, float(t_of[top]), float(q_of[top]))
+            parts = [mine[sound[mine]] for mine in structures if sound[mine].any()]
+            if parts:
+                means = np.stack([log_mean(ratio[mine]) for mine in parts])
+                tops = np.stack([mine[np.argmax(ratio[mine], axis=0)] for mine in parts])
+                top = np.take_along_axis(tops, np.argmax(means, axis=0)[None], axis=0)[0]
+                batch.evidence[name] = log_mean(means)
+                batch.best[name] = (list(top), t_of[top, np.arange(draws)], q_of[top])
 
     def _single(
-        self, result, name: str, where: np.ndarray, b: np.ndarray, own: np.ndarray, cross: np.ndarray, nu: int
+        self, batch: Batch, name: str, where: np.ndarray, b: np.ndarray, own: np.ndarray, cross: np.ndarray, nu: int
     ) -> None:
         left = own - np.sum(cross**2, axis=1)
         keep = left > VANISHED * own
-        t = np.where(keep, b**2 / np.where(keep, left, 1.0), 0.0)
-        self._record(result, name, where, t, np.where(keep, left, 0.0), 1, nu)
+        t = np.where(keep, 1.0 / np.where(keep, left, 1.0), 0.0)[:, None] * b**2
+        self._record(batch, name, where, t, np.where(keep, left, 0.0), 1, nu)
 
-    def _test_points(self, result, cell: Cell, zj: np.ndarray, zy: np.ndarray, rows: np.ndarray, nu: int) -> None:
-        """Sets of anomalous points, up to a third of all: ordered by a robust fit, priced by how many sets there are."""
+    def _test_points(
+        self, batch: Batch, cell: Cell, zj: np.ndarray, zy: np.ndarray, rows: np.ndarray, nu: int
+    ) -> None:
+        """Sets of anomalous points, up to a third of all: in the order of a robust fit, priced by their number."""
         identity = jnp.zeros((len(self.present), len(rows))).at[rows, np.arange(len(rows))].set(1.0)
-        precision = np.asarray(_precision(cell.filter, identity))[rows]
-        left = precision - zj @ zj.T
-        most = max(1, min(len(rows) // 3, nu - 1))
-        ratios, sets = [], []
-        chosen: list[int] = []
-        order = _robust_order(left, zy)
-        for m in range(1, most + 1):
-            chosen = list(order[:m])
-            block = left[np.ix_(chosen, chosen)]
-            t = float(zy[chosen] @ np.linalg.lstsq(block, zy[chosen], rcond=1e-10)[0])
-            price = gammaln(len(rows) + 1) - gammaln(m + 1) - gammaln(len(rows) - m + 1) + np.log(most)
-            ratios.append(float(log_evidence_ratio(np.array(min(t, result.rss)), result.rss, nu, m)) - price)
-            sets.append((rows[chosen], t))
-        top = int(np.argmax(ratios))
-        result.evidence["outliers"] = log_sum(ratios)
-        result.best["outliers"] = (tuple(int(r) for r in sets[top][0]), sets[top][1], float(top + 1))
-        result.energy["outliers"] = np.diag(left)
+        left = np.asarray(_precision(cell.filter, identity))[rows] - zj @ zj.T
+        sizes = np.arange(1, max(1, min(len(rows) // 3, nu - 1)) + 1)
+        price = gammaln(len(rows) + 1) - gammaln(sizes + 1) - gammaln(len(rows) - sizes + 1) + np.log(len(sizes))
+        evidence, sets, explained, dimension = [], [], [], []
+        for y, rss in zip(zy.T, batch.rss, strict=True):
+            order = _robust_order(left, y)
+            t = np.array([_explained(left, y, order[:m]) for m in sizes])
+            ratio = log_evidence_ratio(np.minimum(t, rss), rss, nu, sizes) - price
+            top = int(np.argmax(ratio))
+            evidence.append(float(np.logaddexp.reduce(ratio)))
+            sets.append(tuple(int(r) for r in rows[order[: top + 1]]))
+            explained.append(t[top])
+            dimension.append(top + 1.0)
+        batch.evidence["outliers"] = np.array(evidence)
+        batch.best["outliers"] = (sets, np.array(explained), np.array(dimension))
+        batch.energy["outliers"] = np.diag(left)
 
-    def _lines(self, result: CellResult, cell: Cell, zj: np.ndarray, zy: np.ndarray, nu: int) -> None:
+    def _lines(self, batch: Batch, cell: Cell, zj: np.ndarray, zy: np.ndarray, nu: int) -> None:
         assert self.lines is not None
-        grid = self.lines
+        grid, p = self.lines, zj.shape[1]
         count = len(grid.frequencies)
-        spread = np.zeros((grid.length, zj.shape[1] + 1))
+        spread = np.zeros((grid.length, p + zy.shape[1]))
         np.add.at(spread, grid.index, np.column_stack([zj, zy]))
-        spectrum = np.asarray(scipy.fft.rfft(spread, axis=0))[1 : count + 1]
-        c, s = spectrum.real, -spectrum.imag
-        a11 = cell.line[:, 0, 0] - np.sum(c[:, :-1] ** 2, axis=1)
-        a22 = cell.line[:, 1, 1] - np.sum(s[:, :-1] ** 2, axis=1)
-        a12 = cell.line[:, 0, 1] - np.sum(c[:, :-1] * s[:, :-1], axis=1)
+        spectrum = np.asarray(scipy.fft.rfft(spread, axis=0))[grid.first : grid.first + count]
+        c, s = np.real(spectrum), -np.imag(spectrum)
+        a11 = cell.line[:, 0, 0] - np.sum(c[:, :p] ** 2, axis=1)
+        a22 = cell.line[:, 1, 1] - np.sum(s[:, :p] ** 2, axis=1)
+        a12 = cell.line[:, 0, 1] - np.sum(c[:, :p] * s[:, :p], axis=1)
         determinant = a11 * a22 - a12**2
-        own = cell.line[:, 0, 0] * cell.line[:, 1, 1]
-        keep = (determinant > 1e-3 * own) & (a11 > 0)
-        bc, bs = c[:, -1], s[:, -1]
-        t = np.where(keep, (a22 * bc**2 - 2 * a12 * bc * bs + a11 * bs**2) / np.where(keep, determinant, 1.0), 0.0)
-        self._exact_peaks(cell, t, c, s)
-        self._record(result, "bias_periodic", np.arange(count), t, np.where(keep, a11, 0.0), 2, nu)
+        keep = (determinant > 1e-3 * cell.line[:, 0, 0] * cell.line[:, 1, 1]) & (a11 > 0)
+        weight = np.where(keep, 1.0 / np.where(keep, determinant, 1.0), 0.0)[:, None]
+        bc, bs = c[:, p:], s[:, p:]
+        t = weight * (a22[:, None] * bc**2 - 2 * a12[:, None] * bc * bs + a11[:, None] * bs**2)
+        if t.shape[1] == 1:
+            self._exact_peaks(cell, t[:, 0], c, s)
+        self._record(batch, "bias_periodic", np.arange(count), t, np.where(keep, a11, 0.0), 2, nu)
 
     def _exact_peaks(self, cell: Cell, t: np.ndarray, c: np.ndarray, s: np.ndarray) -> None:
         """Correct the statistic around the leading peaks, in place, by their exact energy."""
@@ -339,15 +373,21 @@ class Scanner:
             around = slice(max(k - PEAK_WIDTH, 0), k + PEAK_WIDTH + 1)
             t[around] = np.minimum(t[around] * (right / t[k] if t[k] > 0 else 0.0), right)
 
-    def _record(self, result, name: str, where: np.ndarray, t: np.ndarray, energy: np.ndarray, q: int, nu: int) -> None:
+    def _record(
+        self, batch: Batch, name: str, where: np.ndarray, t: np.ndarray, energy: np.ndarray, q: int, nu: int
+    ) -> None:
         if not len(where):
             return
-        t = np.minimum(t, result.rss)
-        ratio = log_evidence_ratio(t, result.rss, nu, q)
-        top = int(np.argmax(ratio))
-        result.evidence[name] = float(log_mean(ratio))
-        result.best[name] = (int(where[top]), float(t[top]), float(q))
-        result.energy[name] = energy
+        t = np.minimum(t, batch.rss)
+        ratio = log_evidence_ratio(t, batch.rss, nu, q)
+        top = np.argmax(ratio, axis=0)
+        batch.evidence[name] = log_mean(ratio)
+        batch.best[name] = (list(where[top]), t[top, np.arange(t.shape[1])], np.full(t.shape[1], float(q)))
+        batch.energy[name] = energy
+
+
+def _explained(left: np.ndarray, y: np.ndarray, chosen: np.ndarray) -> float:
+    return float(y[chosen] @ np.linalg.lstsq(left[np.ix_(chosen, chosen)], y[chosen], rcond=1e-10)[0])
 
 
 def _robust_order(left: np.ndarray, zy: np.ndarray) -> np.ndarray:

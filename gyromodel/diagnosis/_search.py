@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import jax.numpy as jnp
@@ -23,6 +23,10 @@ MAXIMUM_ROUNDS = 12
 NEARBY = 10.0
 # An earlier choice is exchanged when another candidate beats it by this many nats given all the others.
 EXCHANGE = 2.0
+# Functions of time that one run cannot tell from a random walk, and the lead (nats) over it at which they are put
+# beside it.
+SLOW_IN_TIME = ("bias_drift", "bias_warmup", "bias_step")
+SLOW_LEAD = 2.5
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,7 @@ class Ranking:
     results: dict[int, CellResult] = field(repr=False)
     log_prior: np.ndarray = field(repr=False)
     slow: dict[int, bool] = field(repr=False)
+    walks: dict[int, bool] = field(repr=False)
     baseline_columns: np.ndarray = field(repr=False)
 
     def best(self, *, drivers: bool) -> tuple[str | None, float]:
@@ -82,6 +87,7 @@ class Selection:
 
     estimate: Estimate
     found: tuple[Found, ...]
+    path: tuple[Found, ...]
     last: Ranking
     estimates: tuple[Estimate, ...]
     driver: str | None
@@ -115,11 +121,12 @@ def rank(scanner: Scanner, cells: list[int], estimate: Estimate, pulses: tuple[i
     posterior = {k: float(np.exp(v - total)) for k, v in statistic.items()}
     walk, flicker = scanner.grid.ratios.walk, scanner.grid.ratios.flicker
     slow = {g: float(walk[g]) > 0 or float(flicker[g]) > 0 for g in cells}
-    return Ranking(statistic, posterior, results, prior, slow, columns)
+    walks = {g: float(walk[g]) > 0 for g in cells}
+    return Ranking(statistic, posterior, results, prior, slow, walks, columns)
 
 
 def rank_where_it_matters(scanner: Scanner, estimate: Estimate, pulses: tuple[int, ...]) -> Ranking:
-    """Rank over the noise cells that matter: every other level, then neighbours of those with weight for a candidate."""
+    """Rank over the noise cells that matter: every other level, then neighbours of those with weight for any."""
     skip = skipped(estimate.model)
     if scanner.only_cells is not None:
         return rank(scanner, scanner.only_cells, estimate, pulses, skip)
@@ -160,41 +167,60 @@ def search(
         progress: called with a line and the fraction done.
         rounds: at most this many additions.
     """
-    found: list[Found] = []
+    path: list[Found] = []
     estimates = [baseline]
     while True:
         estimate = estimates[-1]
-        pulses = tuple(r for f in found for r in f.rows)
+        pulses = tuple(r for f in path for r in f.rows)
         ranking = rank_where_it_matters(scanner, estimate, pulses)
         name, score = ranking.best(drivers=False)
-        if len(found) >= rounds or name is None or score < threshold:
+        if len(path) >= rounds or name is None:
+            break
+        if score < threshold and not _slow_structure(ranking, name, score, threshold):
             break
         step = _addition(scanner, estimate, ranking, name, pulses)
-        after = refit(record, baseline, [*found, step])
+        after = refit(record, baseline, standing([*path, step]))
         if after is None:
             break
         if progress:
-            progress(f"found {name}", min(0.25 + 0.06 * len(found), 0.6))
-        found.append(step)
+            progress(f"found {name}", min(0.25 + 0.06 * len(path), 0.6))
+        path.append(step)
         estimates.append(after)
         if step.rows and scanner.by_points:
             # Which points are right must be settled before anything is read into the rest.
             ranking = rank_where_it_matters(scanner, after, step.rows)
             break
+    driver, score = path[0].ranking.best(drivers=True) if path else (None, -np.inf)
+    if score > max(sum(f.ranking.statistic[f.name] for f in path) + EXCHANGE, threshold):
+        # One smooth driver explains more than all the names together.
+        return Selection(baseline, (), (), path[0].ranking, (baseline,), driver)
+    found = standing(path)
     if sum(f.effect is not None for f in found) > 1:
-        found, estimates[-1] = _exchange(record, scanner, baseline, found, estimates[-1])
-    return _against_drivers(found, ranking, estimates, threshold)
+        found, estimates[-1] = _exchange(record, scanner, baseline, found, estimates[-1], threshold)
+    driver, score = ranking.best(drivers=True)
+    driver = driver if score >= threshold else None
+    return Selection(estimates[-1], tuple(found), tuple(path), ranking, tuple(estimates), driver)
 
 
-def _against_drivers(found: list[Found], last: Ranking, estimates: list[Estimate], threshold: float) -> Selection:
-    """Cut the chain of names where one smooth driver had explained more than all the names from there on together."""
-    for i, step in enumerate(found):
-        driver, score = step.ranking.best(drivers=True)
-        chain = sum(f.ranking.statistic[f.name] for f in found[i:])
-        if i == 0 and driver is not None and score > max(chain + EXCHANGE, threshold):
-            return Selection(estimates[i], tuple(found[:i]), step.ranking, tuple(estimates[: i + 1]), driver)
-    driver, score = last.best(drivers=True)
-    return Selection(estimates[-1], tuple(found), last, tuple(estimates), driver if score >= threshold else None)
+def standing(path: Sequence[Found]) -> list[Found]:
+    """The steps of a path that no later step replaced by a more general form."""
+    later: set[str] = set()
+    kept = []
+    for step in reversed(path):
+        if step.name not in later:
+            kept.append(step)
+        later |= set(step.effect.supersedes) if step.effect is not None else set()
+    return kept[::-1]
+
+
+def _slow_structure(ranking: Ranking, name: str, score: float, threshold: float) -> bool:
+    """Whether a slow change in time is certain, and only a random walk keeps its cause from being so."""
+    if name not in SLOW_IN_TIME or score < SLOW_LEAD:
+        return False
+    still = [g for g, walks in ranking.walks.items() if not walks]
+    logs = np.array([ranking.results[g].log_likelihood + ranking.log_prior[g] for g in still])
+    each = np.array([ranking.results[g].evidence.get(name, -np.inf) for g in still])
+    return bool(still) and log_sum(logs + each) - log_sum(logs) > threshold
 
 
 def skipped(model: GyroModel) -> set[str]:
@@ -245,7 +271,7 @@ def _solved(scanner: Scanner, estimate: Estimate, effect: Effect, g: int, pulses
 
 
 def refit(record: Record, baseline: Estimate, found: list[Found]) -> Estimate | None:
-    """Fit the baseline with everything found; a shape parameter that cannot be estimated is held at its searched value."""
+    """Fit the baseline with everything found; shape parameters that cannot be estimated stay at the searched value."""
     model = baseline.model
     given = baseline.noise_given
     for step in found:
@@ -289,7 +315,7 @@ def leave_one_out(record: Record, scanner: Scanner, baseline: Estimate, found: l
 
 
 def _exchange(
-    record: Record, scanner: Scanner, baseline: Estimate, found: list[Found], estimate: Estimate
+    record: Record, scanner: Scanner, baseline: Estimate, found: list[Found], estimate: Estimate, threshold: float
 ) -> tuple[list[Found], Estimate]:
     """Re-choose each earlier addition given all the others."""
     for i in range(len(found)):
@@ -300,7 +326,7 @@ def _exchange(
             continue
         name, score = ranking.best(drivers=False)
         own = ranking.statistic.get(found[i].name, -np.inf)
-        if name is None or name in (found[i].name, "outliers") or score < own + EXCHANGE:
+        if name is None or name in (found[i].name, "outliers") or score < max(own + EXCHANGE, threshold):
             continue
         others = found[:i] + found[i + 1 :]
         base = refit(record, baseline, others)

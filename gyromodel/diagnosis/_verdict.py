@@ -12,7 +12,7 @@ from gyromodel.diagnosis._bank import smooth_columns
 from gyromodel.diagnosis._evidence import explained_for
 from gyromodel.diagnosis._result import Cause, Confuser, Driver, ParameterValue, Verdict
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._search import Found, Ranking, Selection, form_effect, is_driver, leave_one_out
+from gyromodel.diagnosis._search import SLOW_IN_TIME, Found, Ranking, Selection, form_effect, is_driver, leave_one_out
 from gyromodel.effects import Effect
 from gyromodel.estimate import Estimate
 from gyromodel.model import effect_class, parameter_unit
@@ -25,7 +25,6 @@ CREDIBLE = 0.95
 TIME_MARGIN = 15.0
 # A driver that names leave with more than this share of the structure makes the discrepancy unknown.
 UNKNOWN_SHARE = 0.05
-SLOW_IN_TIME = ("bias_drift", "bias_warmup", "bias_step")
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class Judgement:
 
 
 def credible(ranking: Ranking, name: str, statistic: float, *, runs: int) -> dict[str, float]:
-    """The smallest set of names with 95 % of the posterior, for the cause found as `name`; forms of one family merged."""
+    """The smallest set of names with 95 % of the posterior, for the cause found as `name`; forms of a family merged."""
     own = {k: v for k, v in ranking.statistic.items() if not is_driver(k) and (k != "outliers" or name == "outliers")}
     if name in SLOW_IN_TIME and runs < 2 and statistic < TIME_MARGIN and _coloured(ranking):
         own["noise_random_walk"] = max(0.0, statistic - 1.0)
@@ -160,8 +159,8 @@ def _next_test(names: list[str], record: Record, cause: Cause) -> str:
         rate = np.asarray(record.signals["rate"])[list(cause.points)] * factor("rad/s", "deg/s")
         levels = ", ".join(f"{r:.4g}" for r in sorted(rate))
         return (
-            f"Repeat the points at {levels} deg/s several times, in both directions and in random order: anomalous test "
-            "points do not come back, a curve does."
+            f"Repeat the points at {levels} deg/s several times, in both directions and in random order: anomalous "
+            "test points do not come back, a curve does."
         )
     if "noise_random_walk" in names:
         return "Repeat the run: a deterministic change comes back the same, a random walk does not."
@@ -196,11 +195,7 @@ def _cause(
         if "scale_spline" in members:
             confusers = (Confuser("scale_spline", 0.0), *confusers)
     else:
-        parameters = tuple(
-            ParameterValue(r.name, r.value, r.std, r.unit)
-            for r in estimate.table()
-            if r.effect == name
-        )
+        parameters = tuple(ParameterValue(r.name, r.value, r.std, r.unit) for r in estimate.table() if r.effect == name)
     return Cause(name, parameters, statistic, p, adjusted, members.get(name, 0.0), confusers, tuple(step.rows))
 
 
@@ -237,7 +232,7 @@ def _columns(scanner: Scanner, ranking: Ranking, name: str) -> np.ndarray | None
 
 
 def _separation(scanner: Scanner, ranking: Ranking, a: str, b: str) -> float | None:
-    """Sine of the smallest principal angle between two candidates' whitened, projected columns, in the first's noise."""
+    """Sine of the smallest angle between two candidates' whitened, projected columns, in the noise of the first."""
     first, second = _columns(scanner, ranking, a), _columns(scanner, ranking, b)
     if first is None or second is None:
         return None
@@ -285,7 +280,7 @@ def _remaining(scanner: Scanner, baseline: Estimate, selection: Selection) -> tu
 
 
 def driver_shape(scanner: Scanner, selection: Selection, name: str, unit: str) -> Driver:
-    """The smooth function behind an unknown discrepancy, at the measured points sorted by its first column, with band."""
+    """The smooth function behind an unknown discrepancy and its band, at the measured points by its first column."""
     ranking = selection.last
     columns = _columns(scanner, ranking, name)
     assert columns is not None

@@ -27,8 +27,8 @@ def check_curve(coefficients: Array, hinges: Array, breakpoints: Array) -> None:
     """Refuse a curve without terms, or hinges without their breakpoints."""
     if hinges.shape != breakpoints.shape:
         raise ValueError("a curve has one breakpoint for each hinge")
-    if coefficients.size + hinges.size == 0:
-        raise ValueError("a curve needs a coefficient or a hinge")
+    if coefficients.ndim != 1 or coefficients.size + hinges.size == 0:
+        raise ValueError("a curve needs a list of coefficients, or a hinge")
 
 
 def curve_forms(x: Float[Array, " sample"]) -> list[dict[str, Any]]:

@@ -39,7 +39,7 @@ class ScaleFactor(Effect):
         centred = rate[good] - rate[good].mean()
         energy = float(centred @ centred)
         slope = float(centred @ output[good]) / energy if energy > 0 else 1.0
-        return eqx.tree_at(lambda e: e.value, self, jnp.asarray(slope if slope != 0 else 1.0))
+        return eqx.tree_at(lambda e: e.value, self, jnp.asarray(slope if slope != 0 else 1.0, float))
 
 
 class ScaleAsymmetry(Effect):

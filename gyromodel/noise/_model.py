@@ -17,6 +17,9 @@ from gyromodel.numerics.state_space import MarkovSum
 # Public noise ids and the units they are written in.
 NOISE_UNITS = {"noise_white": "deg/sqrt(h)", "noise_flicker": "deg/h", "noise_random_walk": "deg/h/sqrt(h)"}
 
+# Up to this many samples (averaged test points, say) noise is taken as white: they cannot show its colour.
+FEWEST_FOR_COLOUR = 40
+
 # Markov terms that make up flicker; their time constants span from one sample to the record.
 FLICKER_STATES = 6
 
@@ -53,6 +56,9 @@ def markov_sum(ratios: NoiseRatios, interval: float | Array, span: float | Array
 
 def noise_grid(samples: int, interval: float, span: float) -> NoiseGrid:
     """Cells from invisible to dominant, half an amplitude decade apart; half of each prior sits on "absent"."""
+    if samples <= FEWEST_FOR_COLOUR:
+        zero = jnp.zeros(1)
+        return NoiseGrid(NoiseRatios(zero, zero), np.zeros(1), interval, max(span, 2 * interval))
     flicker = np.concatenate([[0.0], np.geomspace(0.3 / samples, 10.0, _levels(samples, 1.0))])
     walk = np.concatenate([[0.0], np.geomspace(3.0 / samples**2, 3.0, _levels(samples, 2.0))])
     f, w = (x.ravel() for x in np.meshgrid(flicker, walk, indexing="ij"))
