@@ -165,7 +165,10 @@ def _read_effect(place: _Place) -> tuple[Effect, set[tuple[str, str]]]:
     settings = [f.name for f in fields(effect) if f.name not in (*declared, "column", "unit")]
     found = place.mapping(("effect", "value", "fixed", "std", *declared, *settings), label)
     if "value" in found and len(declared) == 1:
-        found[next(iter(declared))] = found.pop("value")
+        name, given = next(iter(declared)), found.pop("value")
+        if name in found:
+            raise given.error(f"value and {name} are the same parameter; keep one")
+        found[name] = given
     elif "value" in found:
         raise found["value"].error(f"{label} has several parameters; name them: {', '.join(declared)}")
     values: dict[str, Any] = {"column": effect.column} if isinstance(effect, BiasColumn) else {}
@@ -220,12 +223,11 @@ def _read_parameter(place: _Place, effect: Effect, name: str) -> dict[str, Any]:
 def _read_setting(place: _Place, effect: Effect, name: str) -> Any:
     default = getattr(effect, name)
     if isinstance(default, tuple | int):
-        try:
-            numbers = tuple(int(p.text()) for p in (place.items(name) if isinstance(default, tuple) else [place]))
-        except ValueError:
-            raise place.error(f"{name} takes whole numbers") from None
-        if any(abs(n) > 100 for n in numbers):
-            raise place.error(f"{name} takes small whole numbers")
+        places = place.items(name) if isinstance(default, tuple) else [place]
+        texts = [p.text() for p in places]
+        if not all(re.fullmatch(r"[-+]?\d{1,2}", text) for text in texts):
+            raise place.error(f"{name} takes whole numbers below 100")
+        numbers = tuple(int(text) for text in texts)
         return numbers if isinstance(default, tuple) else numbers[0]
     return place.quantity()[0] if isinstance(effect, BiasColumn) else place.number_in(SETTING_UNITS[name])
 

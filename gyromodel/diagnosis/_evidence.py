@@ -21,7 +21,7 @@ def log_evidence_ratio(t: np.ndarray, rss: np.ndarray | float, nu: int, q: np.nd
     total = np.full(np.shape(part), -np.inf)
     for size in SIZES:
         total = np.logaddexp(total, -0.5 * nu * np.log1p(-size / (1.0 + size) * part) - half * np.log1p(size))
-    return total - np.log(len(SIZES))
+    return np.asarray(total - np.log(len(SIZES)))
 
 
 def explained_for(log_ratio: float, nu: int, q: int) -> float:
@@ -44,4 +44,4 @@ def log_sum(values: np.ndarray | Sequence[float]) -> float:
 def log_mean(values: np.ndarray) -> np.ndarray:
     """ln of the mean of exponentials over the first axis."""
     top = values.max(axis=0)
-    return top + np.log(np.mean(np.exp(values - top), axis=0))
+    return np.asarray(top + np.log(np.mean(np.exp(values - top), axis=0)))

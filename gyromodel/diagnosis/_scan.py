@@ -271,9 +271,7 @@ class Scanner:
             self._lines(batch, cell, zj, zy, nu)
         return batch
 
-    def _blocks(
-        self, batch: Batch, cell: Cell, zj: np.ndarray, zy: np.ndarray, nu: int, least: np.ndarray
-    ) -> None:
+    def _blocks(self, batch: Batch, cell: Cell, zj: np.ndarray, zy: np.ndarray, nu: int, least: np.ndarray) -> None:
         cross = self.bank.columns.T @ zj
         against = self.bank.columns.T @ zy
         blocks, draws = len(self.bank.blocks), zy.shape[1]
@@ -314,9 +312,7 @@ class Scanner:
         t = np.where(keep, 1.0 / np.where(keep, left, 1.0), 0.0)[:, None] * b**2
         self._record(batch, name, where, t, np.where(keep, left, 0.0), 1, nu)
 
-    def _test_points(
-        self, batch: Batch, cell: Cell, zj: np.ndarray, zy: np.ndarray, rows: np.ndarray, nu: int
-    ) -> None:
+    def _test_points(self, batch: Batch, cell: Cell, zj: np.ndarray, zy: np.ndarray, rows: np.ndarray, nu: int) -> None:
         """Sets of anomalous points, up to a third of all: in the order of a robust fit, priced by their number."""
         identity = jnp.zeros((len(self.present), len(rows))).at[rows, np.arange(len(rows))].set(1.0)
         left = np.asarray(_precision(cell.filter, identity))[rows] - zj @ zj.T

@@ -13,10 +13,20 @@ from gyromodel.numerics.least_squares import Solution
 from gyromodel.numerics.state_space import Filter, whiten
 
 
+# Restarts from where the last solve ended; each measures its tolerances in the residual it starts from.
+RESTARTS = 5
+
+
 def optimistix_solution(model: GyroModel, x, signals, filter: Filter) -> Solution:
-    """Minimise the whitened sum of squares in coordinates scaled by the Jacobian's column norms at the start."""
-    best, cost, steps, done = _solve(model, x, signals, filter)
-    return Solution(np.asarray(best), float(cost), int(steps), bool(done))
+    """Minimise the whitened sum of squares in coordinates scaled by the residual and the Jacobian's column norms."""
+    steps, cost, done = 0, np.inf, False
+    for _ in range(RESTARTS):
+        x, now, more, done = _solve(model, x, signals, filter)
+        steps += int(more)
+        if not float(now) < cost * (1 - 1e-9):
+            break
+        cost = float(now)
+    return Solution(np.asarray(x), float(now), steps, bool(done))
 
 
 @eqx.filter_jit
@@ -27,10 +37,13 @@ def _solve(model: GyroModel, x, signals, filter: Filter):
 
     jacobian = whiten(filter, model.with_vector(x).linearise(signals)[1])
     norm = jnp.linalg.norm(jacobian, axis=0)
-    scale = 1.0 / jnp.where(norm > 0, norm, 1.0)
+    # optimistix compares with absolute tolerances too: of a residual of norm one they are relative.
+    size = jnp.linalg.norm(whitened(x))
+    size = jnp.where(size > 0, size, 1.0)
+    scale = size / jnp.where(norm > 0, norm, size)
     solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-10, linear_solver=lx.SVD())
     found = optx.least_squares(
-        lambda u, _: whitened(x + scale * u), solver, jnp.zeros_like(x), max_steps=256, throw=False
+        lambda u, _: whitened(x + scale * u) / size, solver, jnp.zeros_like(x), max_steps=256, throw=False
     )
     best = x + scale * found.value
     return best, jnp.sum(whitened(best) ** 2), found.stats["num_steps"], found.result == optx.RESULTS.successful

@@ -109,16 +109,14 @@ def _lacks(causes: Sequence[Cause]) -> str:
 
 
 def _with_size(cause: Cause) -> str:
-    """The cause with its size; of more than three parameters, the three that are known best."""
-    values = [p for p in cause.parameters if math.isfinite(p.value)]
+    """The cause with its size; a curve of many coefficients is named without them."""
+    values = [p for p in cause.parameters if math.isfinite(p.value) and p.std != 0.0]
+    if len(values) > 3:
+        return phrase(cause.effect)
     if len(values) == 1:
         return f"{phrase(cause.effect)} of {with_uncertainty(values[0].value, values[0].std, values[0].unit)}"
-    best = sorted(values, key=lambda p: -abs(p.value) / p.std if p.std > 0 else 0.0)[:3]
-    sizes = [f"{spoken(p.name)} {with_uncertainty(p.value, p.std, p.unit)}" for p in values if p in best]
-    if not sizes:
-        return phrase(cause.effect)
-    more = ", …" if len(values) > 3 else ""
-    return f"{phrase(cause.effect)} with {listed(sizes) if not more else ', '.join(sizes)}{more}"
+    sizes = [f"{spoken(p.name)} {with_uncertainty(p.value, p.std, p.unit)}" for p in values]
+    return f"{phrase(cause.effect)} with {listed(sizes)}" if sizes else phrase(cause.effect)
 
 
 def _gain(diagnosis: Diagnosis, extension: str) -> str:
@@ -128,6 +126,8 @@ def _gain(diagnosis: Diagnosis, extension: str) -> str:
         return "the campaign is too short to measure the gain on data not used"
     before, after = pair(gain.before, gain.after)
     unit = unit_text(gain.unit)
+    if gain.before == gain.after:
+        return f"the model is left as it is, with an error on data not used of {before} {unit}"
     low, high = gain.ci95
     if low > 1.0:
         return f"{extension} the error on data not used falls from {before} to {after} {unit}"

@@ -1,0 +1,81 @@
+"""Write docs/effects.md, the catalogue page, from the effects' own declarations.
+
+python docs/make_effects_page.py
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gyromodel.declarations import Declaration, ParameterDeclaration, declarations
+from gyromodel.noise import NOISE_UNITS
+
+PAGE = Path(__file__).with_name("effects.md")
+SITES = {
+    "gain": "The gain itself",
+    "scale": "Terms of the scale-factor error",
+    "rate": "Terms added to the input rate: bias, and what drives it",
+}
+# Two-sided power spectral density of the rate, and Allan variance.
+NOISE_FORMS = {
+    "noise_white": ("N²", "N²/τ"),
+    "noise_flicker": ("B²/(2πf)", "(2 ln2/π) B²"),
+    "noise_random_walk": ("K²/(2πf)²", "K² τ/3"),
+}
+HEAD = """# The effect catalogue
+
+This page is generated from the code by `python docs/make_effects_page.py`. Effect names are those of model files,
+reports and JSON; `gyromodel effects ID` prints one entry in the terminal.
+
+    output = gain · (rate + Σ rate terms) · (1 + Σ scale terms) + noise
+
+Parameters stand in the unit that files and reports use. "Typical" is a usual size; an amplitude starts at zero, which
+is exactly the model without the effect. The model is linear in all parameters but those marked *nonlinear*.
+"""
+
+
+def page() -> str:
+    """The whole page as Markdown."""
+    catalogue = declarations().values()
+    parts = [HEAD, _summary(catalogue)]
+    for site, title in SITES.items():
+        parts.append(f"## {title}\n")
+        parts += [_entry(entry) for entry in catalogue if entry.site == site]
+    parts.append(_noise())
+    return "\n".join(parts)
+
+
+def _summary(catalogue) -> str:
+    rows = [[f"[`{e.id}`](#{e.id})", e.site, _needs(e), e.equation] for e in catalogue]
+    return _table(["effect", "acts on", "needs", "equation"], rows)
+
+
+def _needs(entry: Declaration) -> str:
+    return ", ".join(f"`{name}`" for name in entry.needs) or "–"
+
+
+def _entry(entry: Declaration) -> str:
+    text = [f"### {entry.id}\n", f"{entry.equation}\n"]
+    if entry.details:
+        text.append(f"{entry.details}\n")
+    text += [f"- needs: {_needs(entry)}", f"- cause: {entry.cause}", f"- test that separates it: {entry.test}\n"]
+    rows = [[f"`{p.name}`", p.unit if p.unit != "1" else "–", f"{p.typical:g}", _meaning(p)] for p in entry.parameters]
+    return "\n".join([*text, _table(["parameter", "unit", "typical", "meaning"], rows)])
+
+
+def _meaning(parameter: ParameterDeclaration) -> str:
+    return parameter.meaning if parameter.linear else f"{parameter.meaning} (*nonlinear*)"
+
+
+def _noise() -> str:
+    rows = [[f"`{name}`", unit, *NOISE_FORMS[name]] for name, unit in NOISE_UNITS.items()]
+    return f"## Noise\n\n{_table(['noise', 'unit', 'rate PSD, two-sided', 'Allan variance'], rows)}"
+
+
+def _table(head: list[str], rows: list[list[str]]) -> str:
+    cells = [head, ["---"] * len(head), *([cell.replace("|", "\\|") for cell in row] for row in rows)]
+    return "\n".join(f"| {' | '.join(row)} |" for row in cells) + "\n"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")

@@ -1,0 +1,402 @@
+"""Model files: what is written is read back bit for bit, units come out as numbers worked by hand, and whatever is
+wrong with a file is a `ModelError` that names the line."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import yaml
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from gyromodel import __version__
+from gyromodel.campaign import Campaign
+from gyromodel.effects import CATALOGUE
+from gyromodel.effects.drivers import Bias, BiasColumn
+from gyromodel.effects.scale import ScaleFactor, ScaleSpline
+from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureCurve
+from gyromodel.estimate import Estimate, fit
+from gyromodel.model import GyroModel, ModelError, make_effect, model_from_effects
+from gyromodel.model_files import read_model, write_model
+from gyromodel.signals import read_signals
+from tests.helpers import MUTANTS, SHARED_FOLDER, mutated
+
+# The example of the public contract.
+CONTRACT = """\
+gyro: fog
+effects:
+  - effect: scale_factor
+    value: 1000 count/deg        # optional start value, with unit
+    fixed: true                  # optional: known, not fitted
+  - effect: bias
+  - effect: bias_temperature
+noise: auto                      # or a list of noise_* effects with values
+"""
+FULL = """\
+gyro: fog
+effects:
+  - effect: scale_factor
+    value: 1000 count/(deg/s)
+  - effect: bias
+    value: {value: 3.5 deg/h, std: 0.1 deg/h}
+  - effect: bias_temperature_curve
+    coefficients: [1 deg/h, -2 deg/h]
+    hinges: [3 deg/h/degC]
+    breakpoints: [300 K]
+    reference: 20 degC
+    fixed: [breakpoints]
+  - effect: bias_warmup
+    amplitude: 4 arcsec/s
+    time_constant: 10 min
+  - effect: bias_pressure
+    value: 2 deg/h/mbar
+    reference: 1000 mbar
+  - effect: scale_nonlinearity
+    powers: [2, 5]
+    coefficients: [10 ppm, 0.1 %]
+    full_rate: 100 deg/s
+  - effect: bias_step
+    size: 1 deg/h
+    epoch: 1 h
+noise:
+  - {effect: noise_white, value: 0.1 deg/sqrt(h)}
+  - {effect: noise_flicker, value: 0.2 deg/h}
+  - {effect: noise_random_walk, value: 0.3 deg/h/sqrt(h)}
+"""
+DEG_H = np.pi / 180 / 3600
+
+
+def read(folder: Path, text: str | bytes) -> GyroModel:
+    path = folder / "model.yaml"
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    return read_model(path)
+
+
+def contents(model: GyroModel) -> list:
+    """Everything a model holds, as bytes where it is numbers: equal only when bit for bit."""
+    effects = [(e.label, {f.name: _bytes(getattr(e, f.name)) for f in dataclasses.fields(e)}) for e in model.effects]
+    return [effects, {k: _bytes(v) for k, v in model.noise.items()}, model.fixed, model.gyro]
+
+
+def _bytes(value):
+    return np.asarray(value).tobytes() if isinstance(value, jax.Array) else value
+
+
+def test_example_of_the_contract(tmp_path: Path):
+    model = read(tmp_path, CONTRACT)
+    assert model.labels == ("scale_factor", "bias", "bias_temperature")
+    assert float(model.gain()) == pytest.approx(1000 / np.deg2rad(1))
+    assert model.fixed == {("scale_factor", "value")}
+    assert [s.field for s in model.slots()] == ["value", "coefficient"]
+    assert (model.gyro, dict(model.noise)) == ("fog", {})
+
+
+@pytest.mark.parametrize(("output", "kind"), [("count/s", "rate"), ("count", "rate"), ("count", "increment")])
+def test_example_of_the_contract_fits_counts(output: str, kind: str, tmp_path: Path, rng: np.random.Generator):
+    model = read(tmp_path, CONTRACT)
+    time, rate = np.arange(100.0), rng.uniform(-10, 10, 100)
+    temperature = 20 + rng.standard_normal(100)
+    columns = {"time": time, "rate": rate, "temperature": temperature, "output": 1000 * (rate + 0.5)}
+    columns["output"] = columns["output"] + rng.standard_normal(100)
+    units = {"time": "s", "rate": "deg/s", "temperature": "degC", "output": output}
+    estimate = fit(Campaign(columns, units, {"kind": kind}), model)
+    row = {r.effect: r for r in estimate.table()}
+    assert row["bias"].value == pytest.approx(0.5 * 3600, abs=6 * row["bias"].std)
+    per = "count/(deg/s)" if (output, kind) == ("count", "rate") else "count/deg"
+    assert (row["scale_factor"].value, row["scale_factor"].unit) == (pytest.approx(1000.0), per)
+
+
+def test_units_are_converted(tmp_path: Path):
+    model = read(tmp_path, FULL)
+    scale, bias, curve, warmup, pressure, nonlinearity, step = model.effects
+    assert float(scale.value) == pytest.approx(1000 / np.deg2rad(1))  # type: ignore[attr-defined]
+    assert float(bias.value) == pytest.approx(3.5 * DEG_H)  # type: ignore[attr-defined]
+    assert np.asarray(curve.coefficients) == pytest.approx([DEG_H, -2 * DEG_H])  # type: ignore[attr-defined]
+    assert np.asarray(curve.hinges) == pytest.approx([3 * DEG_H])  # type: ignore[attr-defined]
+    assert np.asarray(curve.breakpoints) == pytest.approx([26.85])  # type: ignore[attr-defined]
+    assert float(curve.reference) == 20.0  # type: ignore[attr-defined]
+    assert float(warmup.amplitude) == pytest.approx(4 * DEG_H)  # type: ignore[attr-defined]
+    assert float(warmup.time_constant) == 600.0  # type: ignore[attr-defined]
+    assert float(pressure.coefficient) == pytest.approx(2 * DEG_H / 100)  # type: ignore[attr-defined]
+    assert float(pressure.reference) == 1e5  # type: ignore[attr-defined]
+    assert nonlinearity.powers == (2, 5)  # type: ignore[attr-defined]
+    assert np.asarray(nonlinearity.coefficients) == pytest.approx([1e-5, 1e-3])  # type: ignore[attr-defined]
+    assert float(nonlinearity.full_rate) == pytest.approx(np.deg2rad(100))  # type: ignore[attr-defined]
+    assert float(step.epoch) == 3600.0  # type: ignore[attr-defined]
+    noise = {k: float(v) for k, v in model.noise.items()}
+    assert noise == pytest.approx({
+        "noise_white": np.deg2rad(0.1) / 60,
+        "noise_flicker": 0.2 * DEG_H,
+        "noise_random_walk": 0.3 * DEG_H / 60,
+    })  # fmt: skip
+    assert model.fixed == {("bias_temperature_curve", "breakpoints")}
+
+
+@pytest.mark.parametrize("text", [CONTRACT, FULL])
+def test_read_write_read_is_exact(text: str, tmp_path: Path):
+    first = read(tmp_path, text)
+    write_model(first, tmp_path / "again.yaml")
+    again = read_model(tmp_path / "again.yaml")
+    assert contents(again) == contents(first)
+    once = (tmp_path / "again.yaml").read_text(encoding="utf-8")
+    write_model(again, tmp_path / "again.yaml")
+    assert (tmp_path / "again.yaml").read_text(encoding="utf-8") == once
+
+
+def test_numbers_are_written_as_they_were_read(tmp_path: Path):
+    write_model(read(tmp_path, FULL), tmp_path / "again.yaml")
+    document = yaml.safe_load((tmp_path / "again.yaml").read_text(encoding="utf-8"))
+    values = {e["effect"]: e for e in document["effects"]}
+    assert values["scale_factor"]["value"] == "1000 count/(deg/s)"
+    assert values["bias"]["value"] == "3.5 deg/h"
+    assert values["bias_temperature_curve"]["coefficients"] == ["1 deg/h", "-2 deg/h"]
+    assert values["bias_temperature_curve"]["reference"] == "20 degC"
+    assert values["bias_pressure"]["coefficient"] == "2 deg/h/mbar"
+    assert values["scale_nonlinearity"]["coefficients"] == ["10 ppm", "1000 ppm"]
+    assert document["noise"][0] == {"effect": "noise_white", "value": "0.1 deg/sqrt(h)"}
+
+
+floats = st.floats(allow_nan=False, allow_infinity=False, min_value=-1e200, max_value=1e200)
+sizes = st.floats(min_value=1e-200, max_value=1e200)
+
+
+@settings(SHARED_FOLDER, max_examples=60)
+@given(st.lists(floats, min_size=7, max_size=7), st.lists(sizes, min_size=4, max_size=4))
+@example([0.1 + 0.2, -0.0, 5e-324, 1e200, -1 / 3, 2 / 3, 1e-30], [1 / 3, 1e-200, 1e200, 2 / 3])
+def test_any_numbers_survive_bit_for_bit(tmp_path: Path, numbers: list[float], positive: list[float]):
+    a, b, c, d, e, f, g = (jnp.asarray(v) for v in numbers)
+    model = GyroModel(
+        (
+            ScaleFactor(value=jnp.asarray(positive[0]), unit="count/deg"),
+            Bias(value=a),
+            BiasTemperatureCurve(
+                coefficients=jnp.stack([b, c]), hinges=jnp.stack([d]), breakpoints=jnp.stack([e]), reference=f
+            ),
+            ScaleSpline(coefficients=jnp.stack([a, b, c, d]), full_rate=e, lowest=f),
+            BiasColumn(coefficient=g, column="supply_voltage", unit="deg/h/V"),
+        ),
+        dict(zip(("noise_white", "noise_flicker", "noise_random_walk"), positive[1:], strict=True)),
+        frozenset({("bias", "value"), ("bias_temperature_curve", "hinges")}),
+        "rlg",
+    )
+    write_model(model, tmp_path / "any.yaml")
+    assert contents(read_model(tmp_path / "any.yaml")) == contents(model)
+
+
+@pytest.mark.parametrize("label", [*sorted(set(CATALOGUE) - {"bias_column"}), "bias_supply_voltage"])
+def test_every_effect_is_written_and_read(label: str, tmp_path: Path):
+    columns = {k: jnp.linspace(-1.0, 2.0, 16) for k in ("time", "time_on", "rate", "temperature", "supply_voltage")}
+    signals = columns | {"output": 3.0 * columns["rate"], "temperature_rate": columns["rate"]}
+    model = GyroModel((make_effect(label).prepared(signals),), {}, frozenset(), "fog")
+    write_model(model, tmp_path / "one.yaml")
+    again = read_model(tmp_path / "one.yaml")
+    expected, found = contents(model), contents(again)
+    if label == "scale_factor":
+        found[0][0][1]["unit"] = ""  # a number without unit is one of a rate output
+    assert found == expected
+    assert np.array_equal(again.predict(signals), model.predict(signals))
+
+
+@pytest.fixture(scope="module")
+def fitted() -> tuple[Campaign, Estimate]:
+    """A fit with every kind of parameter and unit: counts, mbar, a breakpoint, and one held."""
+    rng = np.random.default_rng(7)
+    time = np.arange(256) * 20.0
+    columns = {
+        "time": time,
+        "rate": np.repeat(rng.permutation(np.linspace(-50.0, 40.0, 32)), 8),
+        "temperature": 68 + 27 * np.sin(time / 700),
+        "pressure": 1000 + rng.standard_normal(256),
+    }
+    kelvin = (columns["temperature"] - 32) / 1.8
+    bias = 5 + 0.2 * (kelvin - 20) + 0.3 * np.maximum(kelvin - 25, 0) + 0.1 * (columns["pressure"] - 1000)
+    columns["output"] = 20 * (columns["rate"] * 3600 + bias) * (1 + 1e-5 * (columns["rate"] / 50) ** 2)
+    columns["output"] += 0.5 * rng.standard_normal(256)
+    units = {"time": "s", "rate": "deg/s", "temperature": "degF", "pressure": "mbar", "output": "count"}
+    measured = Campaign(columns, units, {"kind": "rate"})
+    curve = BiasTemperatureCurve(coefficients=jnp.zeros(1), hinges=jnp.zeros(1), breakpoints=jnp.asarray([24.0]))
+    labels = ["scale_factor", "bias", "bias_pressure", "bias_temperature_case", "scale_nonlinearity"]
+    measured = measured.with_column("temperature_case", 60 + rng.standard_normal(256), "degF")
+    model = GyroModel((*(make_effect(n) for n in labels), curve), gyro="fog")
+    return measured, fit(measured, model)
+
+
+def test_a_fitted_model_reads_back_and_predicts_the_same(fitted: tuple[Campaign, Estimate], tmp_path: Path):
+    measured, estimate = fitted
+    write_model(estimate, tmp_path / "fitted.yaml")
+    again = read_model(tmp_path / "fitted.yaml")
+    assert [_bytes(getattr(e, f)) for e in again.effects for f in e.declared()] == [
+        _bytes(getattr(e, f)) for e in estimate.model.effects for f in e.declared()
+    ]
+    assert {k: float(v) for k, v in again.noise.items()} == {k: float(v) for k, v in estimate.model.noise.items()}
+    signals = read_signals(measured).signals
+    assert np.array_equal(again.predict(signals), estimate.model.predict(signals))
+    refitted = fit(measured, again)
+    assert refitted.model.vector() == pytest.approx(np.asarray(estimate.model.vector()), rel=1e-6)
+
+
+def test_a_fitted_model_carries_its_pedigree(fitted: tuple[Campaign, Estimate], tmp_path: Path):
+    measured, estimate = fitted
+    write_model(estimate, tmp_path / "fitted.yaml")
+    document = yaml.safe_load((tmp_path / "fitted.yaml").read_text(encoding="utf-8"))
+    rows = {(r.effect, r.name): r for r in estimate.table()}
+    for effect, name in (("scale_factor", "value"), ("bias", "value"), ("bias_pressure", "coefficient")):
+        entry = next(e for e in document["effects"] if e["effect"] == effect)[name]
+        row = rows[(effect, name)]
+        for shown, number in ((entry["value"], row.value), (entry["std"], row.std)):
+            figure, unit = shown.split(" ")
+            assert float(figure) == pytest.approx(number, rel=1e-14)
+            assert unit == row.unit
+    assert rows[("bias_pressure", "coefficient")].unit == "deg/h/(mbar)"
+    record = document["fit"]
+    assert record["degrees_of_freedom"] == estimate.degrees_of_freedom
+    assert np.array(record["covariance"]["matrix"]) == pytest.approx(estimate.covariance, rel=1e-15)
+    assert len(record["covariance"]["parameters"]) == len(estimate.covariance)
+    assert record["data_hash"] == measured.digest()
+    assert record["validity"]["rate"] == ["-50 deg/s", "40 deg/s"]
+    low, high = (float(v.split()[0]) for v in record["validity"]["temperature"])
+    assert (low, high) == (pytest.approx(5.0, abs=0.2), pytest.approx(35.0, abs=0.2))
+    assert document["software"] == f"gyromodel {__version__}"
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = tmp_path / "new" / "model.yaml"
+    write_model(model_from_effects(["bias"]), path)
+    before = path.read_bytes()
+
+    def broken(*args, **kwargs):
+        raise OSError("disk full")
+
+    monkeypatch.setattr("os.replace", broken)
+    with pytest.raises(OSError, match="disk full"):
+        write_model(model_from_effects(["bias_drift"]), path)
+    assert path.read_bytes() == before
+    assert list(path.parent.iterdir()) == [path]
+
+
+def entry(text: str) -> str:
+    return f"gyro: fog\neffects:\n  - effect: bias\n  - {text}\n"
+
+
+BAD = [
+    ("", 1, "empty"),
+    ("# nothing\n", 1, "empty"),
+    ("gyro: fog\n", 1, "lists no effects"),
+    ("- effect: bias\n", 1, "a model as key: value pairs"),
+    ("effects: bias\n", 1, "effects as a list"),
+    ("gyro: fog\neffects: []\ncolour: red\n", 3, "unknown key 'colour'"),
+    ("gyro: fog\ngyro: rlg\neffects: []\n", 2, "'gyro' appears twice"),
+    ("gyro: [fog]\neffects: []\n", 1, "one value"),
+    ("? [a, b]\n: c\n", 1, "one value"),
+    ("effects:\n  - ? {a: b}\n    : c\n", 2, "needs an effect"),
+    ("effects:\n  - bias\n", 2, "needs an effect"),
+    ("effects:\n  - value: 3 deg/h\n", 2, "needs an effect"),
+    ("gyro: fog\neffects: [\n", 3, "not valid YAML"),
+    ("a: b\n---\nc: d\n", 2, "not valid YAML"),
+    ("effects: &a\n  - *b\n", 2, "not valid YAML"),
+    ("gyro: fog\neffects:\n\t- effect: bias\n", 3, "not valid YAML"),
+    ("gyro: fog\nname: \x07\n", 2, "not allowed"),
+    (b"gyro: fog\nname: \xff\n", 2, "UTF-8"),
+    ('gyro: "\\UFFFFFFFF"\n', 1, "not valid YAML"),
+    ("[" * 5000, 1, "not valid YAML"),
+    (entry("effect: magic"), 4, "unknown effect magic"),
+    (entry("effect: bias_"), 4, "unknown effect bias_"),
+    (entry("effect: [bias]"), 4, "one value"),
+    (entry("effect: bias"), 3, "bias twice"),
+    (entry("{effect: bias_drift, colour: red}"), 4, "unknown key 'colour' in bias_drift; known are"),
+    (entry("{effect: bias_drift, value: 3}"), 4, "'3' is without unit: deg/h/h"),
+    (entry("{effect: bias_drift, value: 3 deg/h}"), 4, "'3 deg/h' is not in deg/h/h"),
+    (entry("{effect: bias_drift, value: 3 furlong}"), 4, "unknown unit 'furlong'"),
+    (entry("{effect: bias_drift, value: fast}"), 4, "is no quantity"),
+    (entry("{effect: bias_drift, value: }"), 4, "is no quantity"),
+    (entry("{effect: bias_drift, value: nan deg/h/h}"), 4, "is no quantity"),
+    (entry("{effect: bias_drift, value: 1e999 deg/h/h}"), 4, "is no quantity"),
+    (entry("{effect: bias_drift, value: 1e308 turn/s/s}"), 4, "too large"),
+    (entry("{effect: bias_drift, value: [3 deg/h/h]}"), 4, "one value"),
+    (entry("{effect: bias_drift, value: {std: 3 deg/h/h}}"), 4, "slope has no value"),
+    (entry("{effect: bias_drift, value: {value: 3, unit: deg/h/h}}"), 4, "unknown key 'unit'"),
+    (entry("{effect: bias_drift, value: {value: {value: 3 deg/h/h}}}"), 4, "one value"),
+    (entry("{effect: bias_drift, value: 3 deg/h/h, slope: 4 deg/h/h}"), 4, "value and slope are the same"),
+    (entry("{effect: bias_warmup, value: 3 deg/h}"), 4, "several parameters; name them: amplitude, time_constant"),
+    (entry("{effect: bias_drift, fixed: maybe}"), 4, "fixed is true, false or a list"),
+    (entry("{effect: bias_drift, fixed: [pace]}"), 4, "fixed is true, false or a list"),
+    (entry("{effect: scale_factor, fixed: true}"), 4, "scale_factor is fixed but has no value"),
+    (entry("{effect: scale_factor, value: 0 count/deg}"), 4, "cannot be zero"),
+    (entry("{effect: scale_factor, value: 3 K}"), 4, "'3 K' is not in count/deg or count/(deg/s) or"),
+    (entry("{effect: scale_factor, value: 3 count}"), 4, "not in count/deg or count/(deg/s) or"),
+    (entry("{effect: bias_temperature, reference: 20}"), 4, "'20' is without unit: degC"),
+    (entry("{effect: bias_temperature, reference: 20 V}"), 4, "'20 V' is not in degC"),
+    (entry("{effect: bias_temperature, reference: [20 degC]}"), 4, "one value"),
+    (entry("{effect: bias_temperature_curve, coefficients: []}"), 4, "bias_temperature_curve: "),
+    (entry("{effect: bias_temperature_curve, hinges: [3 deg/h/degC]}"), 4, "bias_temperature_curve: "),
+    (entry("{effect: bias_temperature_curve, breakpoints: [3]}"), 4, "'3' is without unit: degC"),
+    (entry("{effect: scale_nonlinearity, powers: [2, x]}"), 4, "whole numbers"),
+    (entry("{effect: scale_nonlinearity, powers: 2}"), 4, "powers as a list"),
+    (entry("{effect: scale_nonlinearity, powers: [1]}"), 4, "scale_nonlinearity: "),
+    (entry("{effect: scale_nonlinearity, powers: [2, 3], coefficients: [3 ppm]}"), 4, "scale_nonlinearity: "),
+    (entry("{effect: scale_spline, knots: 2}"), 4, "scale_spline: "),
+    (entry("{effect: scale_spline, knots: 1000000000}"), 4, "whole numbers below 100"),
+    (entry("{effect: scale_spline, knots: 6.5}"), 4, "whole numbers"),
+    ("effects: []\nnoise: loud\n", 2, "noise is"),
+    ("effects: []\nnoise: []\n", 2, "needs a noise_white above zero"),
+    ("effects: []\nnoise:\n  - {effect: noise_flicker, value: 1 deg/h}\n", 3, "needs a noise_white above zero"),
+    ("effects: []\nnoise:\n  - {effect: noise_white, value: 0 deg/sqrt(h)}\n", 3, "needs a noise_white above zero"),
+    ("effects: []\nnoise:\n  - {effect: noise_pink, value: 1 deg/h}\n", 3, "unknown noise noise_pink"),
+    ("effects: []\nnoise:\n  - {effect: noise_white}\n", 3, "needs an effect: id and a value"),
+    ("effects: []\nnoise:\n  - {effect: noise_white, value: -1 deg/sqrt(h)}\n", 3, "cannot be negative"),
+    ("effects: []\nnoise:\n  - {effect: noise_white, value: 1 deg/h}\n", 3, "not in deg/sqrt(h)"),
+    ("effects: []\nnoise: {effect: noise_white, value: 1 deg/h}\n", 2, "noise as a list"),
+    (
+        "effects: []\nnoise:\n  - {effect: noise_white, value: 1 deg/sqrt(h)}\n"
+        "  - {effect: noise_white, value: 1 deg/sqrt(h)}\n",
+        4,
+        "noise_white appears twice",
+    ),
+]
+
+
+@pytest.mark.parametrize(("text", "line", "message"), BAD)
+def test_mistakes_are_named_with_their_line(text: str | bytes, line: int, message: str, tmp_path: Path):
+    with pytest.raises(ModelError) as caught:
+        read(tmp_path, text)
+    assert str(caught.value).startswith(f"model.yaml, line {line}: ")
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_cannot_be_opened_is_named(tmp_path: Path):
+    with pytest.raises(ModelError, match=r"missing\.yaml: no such file"):
+        read_model(tmp_path / "missing.yaml")
+    with pytest.raises(ModelError, match="cannot be read"):
+        read_model(tmp_path)
+
+
+@settings(SHARED_FOLDER, max_examples=300)
+@given(st.sampled_from([CONTRACT, FULL]), MUTANTS)
+def test_a_damaged_file_is_read_or_refused(tmp_path: Path, text: str, changes: list[tuple[str, int, int, bytes]]):
+    complaint = ""
+    try:
+        model = read(tmp_path, mutated(text.encode(), changes))
+        write_model(model, tmp_path / "again.yaml")
+        assert contents(read_model(tmp_path / "again.yaml")) == contents(model)
+    except ModelError as problem:
+        complaint = str(problem)
+    assert not complaint or re.fullmatch(r"model\.yaml, line \d+: .+", complaint)
+
+
+def test_one_value_stands_for_a_list_of_one(tmp_path: Path):
+    effect = read(tmp_path, entry("{effect: bias_temperature_curve, coefficients: 3 deg/h}")).effects[1]
+    assert np.asarray(effect.coefficients) == pytest.approx([3 * DEG_H])  # type: ignore[attr-defined]
+
+
+def test_absolute_zero_and_fahrenheit_references(tmp_path: Path):
+    effect = read(tmp_path, entry("{effect: bias_temperature, value: 1 deg/h/degF, reference: 212 degF}")).effects[1]
+    assert isinstance(effect, BiasTemperature)
+    assert float(effect.reference) == pytest.approx(100.0)
+    assert float(effect.coefficient) == pytest.approx(1.8 * DEG_H)
