@@ -5,6 +5,7 @@ python docs/make_effects_page.py
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 
 from gyromodel.declarations import Declaration, ParameterDeclaration, declarations
@@ -13,7 +14,7 @@ from gyromodel.noise import NOISE_UNITS
 PAGE = Path(__file__).with_name("effects.md")
 SITES = {
     "gain": "The gain itself",
-    "scale": "Terms of the scale-factor error",
+    "scale": "Terms of the scale-factor error ε",
     "rate": "Terms added to the input rate: bias, and what drives it",
 }
 # Two-sided power spectral density of the rate, and Allan variance.
@@ -45,7 +46,7 @@ def page() -> str:
     return "\n".join(parts)
 
 
-def _summary(catalogue) -> str:
+def _summary(catalogue: Collection[Declaration]) -> str:
     rows = [[f"[`{e.id}`](#{e.id})", e.site, _needs(e), e.equation] for e in catalogue]
     return _table(["effect", "acts on", "needs", "equation"], rows)
 
@@ -55,12 +56,18 @@ def _needs(entry: Declaration) -> str:
 
 
 def _entry(entry: Declaration) -> str:
-    text = [f"### {entry.id}\n", f"{entry.equation}\n"]
+    text = [f"### {entry.id}\n", f"{_plain(entry.equation)}\n"]
     if entry.details:
-        text.append(f"{entry.details}\n")
+        text.append(f"{_plain(entry.details)}\n")
     text += [f"- needs: {_needs(entry)}", f"- cause: {entry.cause}", f"- test that separates it: {entry.test}\n"]
-    rows = [[f"`{p.name}`", p.unit if p.unit != "1" else "–", f"{p.typical:g}", _meaning(p)] for p in entry.parameters]
+    rows = [[f"`{p.name}`", _unit(entry, p), f"{p.typical:g}", _meaning(p)] for p in entry.parameters]
     return "\n".join([*text, _table(["parameter", "unit", "typical", "meaning"], rows)])
+
+
+def _unit(entry: Declaration, parameter: ParameterDeclaration) -> str:
+    if entry.site == "gain":
+        return "the output's, per deg/s"
+    return "–" if parameter.unit == "1" else parameter.unit
 
 
 def _meaning(parameter: ParameterDeclaration) -> str:
@@ -73,8 +80,13 @@ def _noise() -> str:
 
 
 def _table(head: list[str], rows: list[list[str]]) -> str:
-    cells = [head, ["---"] * len(head), *([cell.replace("|", "\\|") for cell in row] for row in rows)]
+    cells = [head, ["---"] * len(head), *([_plain(cell).replace("|", "\\|") for cell in row] for row in rows)]
     return "\n".join(f"| {' | '.join(row)} |" for row in cells) + "\n"
+
+
+def _plain(text: str) -> str:
+    """Text whose angle brackets are no HTML."""
+    return text.replace("<", "&lt;")
 
 
 if __name__ == "__main__":

@@ -149,7 +149,8 @@ def test_a_model_the_campaign_does_not_determine_is_refused(rng: np.random.Gener
 def test_calibration_is_kept_by_design(rng: np.random.Generator, tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     record = read_signals(static_log(rng))
-    baseline = fit_record(record, gm.model_from_effects(["bias"]))
+    white = NoiseRatios(jnp.zeros(()), jnp.zeros(()))
+    baseline = fit_record(record, gm.model_from_effects(["bias"]), ratios=white)
     ratios = NoiseRatios(jnp.zeros(1), jnp.zeros(1))
     grid = NoiseGrid(ratios, np.zeros(1), record.interval, record_span(record))
     scanner = Scanner(record, build_bank(record), grid)
@@ -194,3 +195,18 @@ def test_fiber_optic_rig_is_named_and_the_error_falls(measured_data) -> None:
     assert found.gain.ci95[0] > 50
     errors = [r.held_out for r in found.rounds]
     assert errors == sorted(errors, reverse=True)
+
+
+def stated(model: gm.GyroModel) -> gm.GyroModel:
+    """The model with white noise of 1 deg/h at 20 s stated, and nothing else."""
+    white = np.pi / 180 / 3600 * np.sqrt(20.0)
+    return gm.GyroModel(model.effects, {"noise_white": white}, model.fixed, model.gyro)
+
+
+def test_noise_that_the_model_does_not_state_is_a_cause(rng: np.random.Generator) -> None:
+    walk = np.cumsum(rng.normal(size=ROWS))
+    found = gm.diagnose(static_log(rng, walk), stated(gm.model_from_effects(["bias"])), hold_out=False)
+    assert found.verdict in ("named", "ambiguous")
+    assert "noise_random_walk" in found.credible_set
+    quiet = gm.diagnose(static_log(rng), stated(gm.model_from_effects(["bias"])), hold_out=False)
+    assert quiet.verdict == "adequate"

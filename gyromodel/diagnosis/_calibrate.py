@@ -41,9 +41,9 @@ def null_scores(
     if kept.exists():
         return np.load(kept)
     skip = skipped(baseline.model)
-    cells = cells_of_weight(rank(scanner, scanner.coarse_cells(), baseline, (), skip), NEARBY)
-    if scanner.only_cells is not None:
-        cells = scanner.only_cells
+    cells = scanner.only_cells
+    if cells is None:
+        cells = cells_of_weight(rank(scanner, scanner.coarse_cells(), baseline, (), skip), NEARBY)
     filter = filter_of(scanner.record, baseline.ratios)
     columns = np.asarray(baseline.model.linearise(scanner.record.signals)[1])
     prior = scanner.grid.log_prior[cells][:, None]

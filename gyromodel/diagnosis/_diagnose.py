@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +22,7 @@ from gyromodel.diagnosis._search import (
     Selection,
     cells_of_weight,
     is_driver,
+    is_noise,
     search,
     standing,
 )
@@ -28,7 +30,7 @@ from gyromodel.diagnosis._variance import growing_noise, tails, with_variance
 from gyromodel.diagnosis._verdict import driver_shape, judge, minimum_detectable, testable
 from gyromodel.estimate import Estimate, fit_record
 from gyromodel.model import GyroModel, record_span
-from gyromodel.noise import NoiseGrid, noise_grid
+from gyromodel.noise import NoiseGrid, NoiseRatios, noise_grid
 from gyromodel.signals import Record, read_signals
 from gyromodel.units import convertible, factor
 
@@ -41,9 +43,9 @@ FOLD_NEARBY = 5.0
 class _Session:
     """One record with its search laid out: what the main pass and every fold do alike."""
 
-    def __init__(self, record: Record, bank: Bank, grid: NoiseGrid, threshold: float) -> None:
+    def __init__(self, record: Record, bank: Bank, grid: NoiseGrid, threshold: float, stated: bool) -> None:
         self.record, self.bank, self.grid, self.threshold = record, bank, grid, threshold
-        self.scanner = Scanner(record, bank, grid)
+        self.scanner = Scanner(record, bank, grid, stated=stated)
         self._ladder: dict[int, tuple[float, float, bool]] = {}
 
     def ladder(self, estimate: Estimate) -> tuple[float, float, bool]:
@@ -107,7 +109,7 @@ def diagnose(
     say("laying out the search", 0.06)
     bank = build_bank(record)
     grid = _grid(record, baseline)
-    session = _Session(record, bank, grid, SAFE_THRESHOLD)
+    session = _Session(record, bank, grid, SAFE_THRESHOLD, baseline.noise_given)
     nulls = np.zeros(0)
     if calibrate:
         nulls = null_scores(session.scanner, baseline, calibrate, seed, say)
@@ -119,7 +121,7 @@ def diagnose(
         findings.append(f"The noise level follows {grows[0]}; samples are weighted accordingly.")
         record = with_variance(record, grows[1])
         baseline = fit_record(record, model)
-        session = _Session(record, bank, grid, session.threshold)
+        session = _Session(record, bank, grid, session.threshold, baseline.noise_given)
         selection = (session.run_and_prune if hold_out else session.run)(baseline, say)
     heavy = tails(selection.estimate)
     findings += [heavy] if heavy else []
@@ -169,12 +171,14 @@ def diagnose(
 
 
 def _grid(record: Record, baseline: Estimate) -> NoiseGrid:
-    """Noise cells to sum over: all of the family, or the one the model states."""
-    span = record_span(record)
-    if baseline.noise_given:
-        ratios = type(baseline.ratios)(*(jnp.atleast_1d(r) for r in baseline.ratios))
-        return NoiseGrid(ratios, np.zeros(1), record.interval, max(span, 2 * record.interval))
-    return noise_grid(int(record.present.sum()), record.interval, span)
+    """Noise cells: the whole family; where the model states its noise, that cell first."""
+    grid = noise_grid(int(record.present.sum()), record.interval, record_span(record))
+    if not baseline.noise_given:
+        return grid
+    ratios = NoiseRatios(
+        *(jnp.concatenate([jnp.atleast_1d(a), b]) for a, b in zip(baseline.ratios, grid.ratios, strict=True))
+    )
+    return grid._replace(ratios=ratios, log_prior=np.concatenate([[0.0], grid.log_prior]))
 
 
 def _rate_unit(campaign: Campaign) -> str:
@@ -186,14 +190,14 @@ def _rate_unit(campaign: Campaign) -> str:
 
 
 def _gain(session: _Session, baseline: Estimate, selection: Selection, unit: str, scale: float, ordinary, say) -> Gain:
-    if not any(f.effect is not None for f in selection.found):
+    if not any(f.effect is not None or f.frees_noise for f in selection.found):
         return no_gain(session.record, baseline, unit, scale)
 
     rankings = [f.ranking for f in selection.path] + [selection.last]
     cells = sorted({g for ranking in rankings for g in cells_of_weight(ranking, FOLD_NEARBY)})
 
     def select(record: Record, base: Estimate) -> Estimate:
-        fold = _Session(record, session.bank, session.grid, session.threshold)
+        fold = _Session(record, session.bank, session.grid, session.threshold, base.noise_given)
         fold.scanner.only_cells = cells
         return fold.run(base).estimate
 
@@ -233,10 +237,11 @@ def _rounds(session: _Session, selection: Selection, scale: float, hold_out: boo
 
 def _ranking(ranking: Ranking) -> tuple[Candidate, ...]:
     order = sorted(ranking.statistic, key=lambda k: -ranking.statistic[k])[:12]
-    return tuple(
-        Candidate(str(k), ranking.statistic[k], ranking.posterior[k], "driver" if is_driver(k) else "effect")
-        for k in order
-    )
+    return tuple(Candidate(str(k), ranking.statistic[k], ranking.posterior[k], _kind(k)) for k in order)
+
+
+def _kind(name: str) -> Literal["effect", "driver", "noise"]:
+    return "driver" if is_driver(name) else "noise" if is_noise(name) else "effect"
 
 
 def _together(campaigns: list[Campaign]) -> Campaign:

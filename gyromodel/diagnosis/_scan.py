@@ -132,14 +132,18 @@ class Batch:
 class Scanner:
     """Evidence of a bank's candidates on one record (or the record less some rows), over noise cells."""
 
-    def __init__(self, record: Record, bank: Bank, grid: NoiseGrid, *, outliers: bool = True) -> None:
+    def __init__(
+        self, record: Record, bank: Bank, grid: NoiseGrid, *, outliers: bool = True, stated: bool = False
+    ) -> None:
         self.record, self.bank, self.grid = record, bank, grid
         self.present = np.asarray(record.sampling.present)
         single = int(np.asarray(record.sampling.restart).sum()) == 1
         self.steps = single and "bias_step" in bank.scans
         self.lines = line_grid(record) if single and "bias_periodic" in bank.scans and record.rows >= 16 else None
         self.outliers = outliers
-        self.only_cells = self.all_cells() if len(grid.log_prior) == 1 else None
+        # With stated noise the first cell is the statement, and the rest are what it may lack.
+        self.stated = stated
+        self.only_cells = self.all_cells()[: 1 if stated else None] if stated or len(grid.log_prior) == 1 else None
         self.by_points = int(self.present.sum()) <= TEST_POINTS
         self.cells: dict[int, Cell] = {}
         extra = self.lines.basis if self.lines else np.zeros((len(self.present), 0))
@@ -162,6 +166,15 @@ class Scanner:
     def all_cells(self) -> list[int]:
         """Every noise cell."""
         return list(range(len(self.grid.log_prior)))
+
+    def noise_families(self) -> dict[str, list[int]]:
+        """Cells with more of one kind of noise than stated, and no more of the other; none where noise is estimated."""
+        if not self.stated:
+            return {}
+        flicker, walk = (np.asarray(r) for r in self.grid.ratios)
+        more_flicker, more_walk = flicker > 1.5 * flicker[0], walk > 1.5 * walk[0]
+        families = {"noise_flicker": more_flicker & ~more_walk, "noise_random_walk": more_walk & ~more_flicker}
+        return {name: [int(g) for g in np.flatnonzero(f)] for name, f in families.items() if f.any()}
 
     def _levels(self) -> tuple[np.ndarray, np.ndarray]:
         flicker, walk = (np.unique(np.asarray(r), return_inverse=True)[1] for r in self.grid.ratios)

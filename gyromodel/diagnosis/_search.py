@@ -71,6 +71,11 @@ def is_driver(name: str) -> bool:
     return name.startswith("smooth(")
 
 
+def is_noise(name: str) -> bool:
+    """Whether a candidate is a kind of noise."""
+    return name.startswith("noise_")
+
+
 @dataclass(frozen=True)
 class Found:
     """One accepted addition and the ranking that spoke for it."""
@@ -79,6 +84,11 @@ class Found:
     effect: Effect | None
     rows: tuple[int, ...]
     ranking: Ranking
+
+    @property
+    def frees_noise(self) -> bool:
+        """Whether it says that the stated noise lacks something, so that the noise is estimated from here on."""
+        return is_noise(self.name)
 
 
 @dataclass(frozen=True)
@@ -109,7 +119,10 @@ def rank(scanner: Scanner, cells: list[int], estimate: Estimate, pulses: tuple[i
         for b in scanner.bank.blocks
         if b.effect is not None and b.effect.supersedes
     }
-    results = scanner.run(cells, columns, residual, contained)
+    families = scanner.noise_families() if estimate.noise_given else {}
+    wanted = sorted({*cells, *(g for f in families.values() for g in f)})
+    everything = scanner.run(wanted, columns, residual, contained)
+    results = {g: everything[g] for g in cells}
     prior = scanner.grid.log_prior
     logs = np.array([results[g].log_likelihood + prior[g] for g in cells])
     null = log_sum(logs)
@@ -117,6 +130,9 @@ def rank(scanner: Scanner, cells: list[int], estimate: Estimate, pulses: tuple[i
     for name in sorted({n for r in results.values() for n in r.evidence} - skip):
         each = [results[g].evidence.get(name, -np.inf) for g in cells]
         statistic[name] = log_sum(logs + np.array(each)) - null
+    for name, family in families.items():
+        more = np.array([everything[g].log_likelihood for g in family])
+        statistic[name] = log_sum(more) - np.log(len(family)) - null
     total = log_sum(list(statistic.values())) if statistic else 0.0
     posterior = {k: float(np.exp(v - total)) for k, v in statistic.items()}
     walk, flicker = scanner.grid.ratios.walk, scanner.grid.ratios.flicker
@@ -128,8 +144,10 @@ def rank(scanner: Scanner, cells: list[int], estimate: Estimate, pulses: tuple[i
 def rank_where_it_matters(scanner: Scanner, estimate: Estimate, pulses: tuple[int, ...]) -> Ranking:
     """Rank over the noise cells that matter: every other level, then neighbours of those with weight for any."""
     skip = skipped(estimate.model)
-    if scanner.only_cells is not None:
+    if scanner.only_cells is not None and (estimate.noise_given or not scanner.stated):
         return rank(scanner, scanner.only_cells, estimate, pulses, skip)
+    if scanner.stated:
+        return rank(scanner, scanner.all_cells(), estimate, pulses, skip)
     ranking = rank(scanner, scanner.coarse_cells(), estimate, pulses, skip)
     near = set(cells_of_weight(ranking, NEARBY))
     return rank(scanner, scanner.neighbours(near), estimate, pulses, skip)
@@ -230,7 +248,9 @@ def skipped(model: GyroModel) -> set[str]:
 
 
 def _addition(scanner: Scanner, estimate: Estimate, ranking: Ranking, name: str, pulses: tuple[int, ...]) -> Found:
-    """A named candidate as an effect at its best form, or as rows given up."""
+    """A named candidate as an effect at its best form, as rows given up, or as noise that is not stated."""
+    if is_noise(name):
+        return Found(name, None, (), ranking)
     form, _, _ = ranking.best_form(name)
     if name == "outliers":
         rows = form if isinstance(form, tuple) else (form,)
@@ -273,7 +293,7 @@ def _solved(scanner: Scanner, estimate: Estimate, effect: Effect, g: int, pulses
 def refit(record: Record, baseline: Estimate, found: list[Found]) -> Estimate | None:
     """Fit the baseline with everything found; shape parameters that cannot be estimated stay at the searched value."""
     model = baseline.model
-    given = baseline.noise_given
+    given = baseline.noise_given and not any(f.frees_noise for f in found)
     for step in found:
         if step.effect is not None:
             model = model.with_effect(step.effect)
@@ -326,7 +346,12 @@ def _exchange(
             continue
         name, score = ranking.best(drivers=False)
         own = ranking.statistic.get(found[i].name, -np.inf)
-        if name is None or name in (found[i].name, "outliers") or score < max(own + EXCHANGE, threshold):
+        if (
+            name is None
+            or is_noise(name)
+            or name in (found[i].name, "outliers")
+            or score < max(own + EXCHANGE, threshold)
+        ):
             continue
         others = found[:i] + found[i + 1 :]
         base = refit(record, baseline, others)

@@ -179,6 +179,12 @@ def _cause(
     null_scores: np.ndarray,
 ) -> Cause:
     name = step.name
+    if step.frees_noise:
+        row = estimate.noise_table()[name]
+        value, low, high = (float(row[k]) for k in ("value", "lo", "hi"))
+        size = ParameterValue(name, value, (high - low) / 3.92, str(row["unit"]))
+        p = float(np.exp(-max(statistic, 0.0)))
+        return Cause(name, (size,), statistic, p, min(1.0, p * trials), members.get(name, 0.0))
     g = ranking.best_cell(name)
     result = ranking.results[g]
     _, explained, q = result.best[name]

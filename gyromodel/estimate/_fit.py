@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Literal
 
 import jax
@@ -192,11 +192,14 @@ def best_ratios(record: Record, model: GyroModel, *, coarse: bool, start: NoiseR
         best = _at(grid.ratios, int(np.argmax(likelihood(grid.ratios))))
     for width in (2.2, 1.3, 0.7, 0.4, 0.2) if coarse else (0.7, 0.35, 0.17):
         factors = np.exp(width * np.linspace(-1, 1, 5))
-        flicker, walk = (np.unique(np.asarray(r) * factors) for r in best)
-        f, w = (jnp.asarray(v.ravel()) for v in np.meshgrid(flicker, walk, indexing="ij"))
-        cells = NoiseRatios(f, w)
+        cells = _mesh(np.unique(np.asarray(r) * factors) for r in best)
         best = _at(cells, int(np.argmax(likelihood(cells))))
     return best
+
+
+def _mesh(levels: Iterable[np.ndarray]) -> NoiseRatios:
+    """Cells at every pair of levels of flicker and walk."""
+    return NoiseRatios(*(v.ravel() for v in np.meshgrid(*levels, indexing="ij")))
 
 
 def _at(ratios: NoiseRatios, i: int) -> NoiseRatios:
@@ -228,7 +231,7 @@ def _finish(
     likelihood = restricted_likelihood(one, *args)
     gain = float(model.gain())
     noise = dict(model.noise) or noise_coefficients(ratios, variance, record, gain)
-    spans = _noise_intervals(args, record, gain) if intervals and not model.noise else {}
+    spans = _noise_intervals(args, ratios, record, gain) if intervals and not model.noise else {}
     rows = record.rows
     whitened = np.full(rows, np.nan)
     whitened[record.present] = w[:, p] / np.sqrt(variance)
@@ -295,17 +298,17 @@ def _coloured_transposed(filter: Filter, columns):
     return jax.vmap(lambda c: transposed(c)[0], in_axes=1, out_axes=1)(columns)
 
 
-def _noise_intervals(args, record: Record, gain: float) -> dict[str, tuple[float, float]]:
+def _noise_intervals(args, best: NoiseRatios, record: Record, gain: float) -> dict[str, tuple[float, float]]:
     """95 % intervals of the noise coefficients: their ranges over the cells that a likelihood ratio does not reject."""
-    cells = noise_grid(int(record.present.sum()), record.interval, record_span(record)).ratios
+    grid = noise_grid(int(record.present.sum()), record.interval, record_span(record)).ratios
+    cells = _mesh(np.union1d(r, float(b) * np.array([0.2, 1.0, 5.0])) for r, b in zip(grid, best, strict=True))
     for margin in (4.0, 2.0, 2.0, 2.0, 0.0):
         result = restricted_likelihood(cells, *args)
         below = result.log_likelihood.max() - result.log_likelihood
         kept = below < REJECTED
         if not margin or kept.sum() > 2 * INTERVAL_LEVELS:
             break
-        levels = [_levels(np.asarray(ratio), below < margin * REJECTED) for ratio in cells]
-        cells = NoiseRatios(*(jnp.asarray(v.ravel()) for v in np.meshgrid(*levels, indexing="ij")))
+        cells = _mesh(_levels(np.asarray(ratio), below < margin * REJECTED) for ratio in cells)
     white = result.residual_sum[kept] / result.degrees_of_freedom
     ratios = NoiseRatios(cells.flicker[kept], cells.walk[kept])
     spans = {k: (float(v.min()), float(v.max())) for k, v in noise_coefficients(ratios, white, record, gain).items()}

@@ -12,7 +12,6 @@ from gyromodel.model import GyroModel
 from gyromodel.numerics.least_squares import Solution
 from gyromodel.numerics.state_space import Filter, whiten
 
-
 # Restarts from where the last solve ended; each measures its tolerances in the residual it starts from.
 RESTARTS = 5
 

@@ -12,8 +12,9 @@ from jaxtyping import Array, Float
 from gyromodel.noise._model import NoiseRatios, markov_sum
 from gyromodel.numerics.state_space import Sampling, build_filter, whiten
 
-# Cells whitened together: enough to fill vector units, few enough for memory.
-CELLS_TOGETHER = 32
+# Cells whitened together: enough to fill vector units, few enough for memory, and fewer for records of many samples.
+CELLS_TOGETHER, FEW_CELLS = 32, 4
+MANY_SAMPLES = 50_000
 COLUMN_STEP = 8
 
 
@@ -42,9 +43,10 @@ def gram_by_cell(
     width = -(-columns.shape[1] // COLUMN_STEP) * COLUMN_STEP
     padded = jnp.pad(columns, ((0, 0), (0, width - columns.shape[1])))
     count = ratios.flicker.shape[0]
-    together = CELLS_TOGETHER if count > 4 else 4
+    together = CELLS_TOGETHER if count > FEW_CELLS and len(columns) <= MANY_SAMPLES else FEW_CELLS
     groups = -(-count // together)
-    fill = NoiseRatios(*(jnp.pad(x, (0, groups * together - count), mode="edge") for x in ratios))
+    # In NumPy: JAX would compile the padding and slicing for every number of cells.
+    fill = NoiseRatios(*(np.pad(np.asarray(x), (0, groups * together - count), mode="edge") for x in ratios))
     logs, grams = [], []
     for i in range(groups):
         part = NoiseRatios(*(x[i * together : (i + 1) * together] for x in fill))

@@ -27,8 +27,8 @@ FLICKER_STATES = 6
 class NoiseRatios(NamedTuple):
     """Flicker B² and random walk K²·(one sample interval), each over the white variance of a sample."""
 
-    flicker: Float[Array, "*cell"]
-    walk: Float[Array, "*cell"]
+    flicker: Float[Array | np.ndarray, "*cell"]
+    walk: Float[Array | np.ndarray, "*cell"]
 
 
 class NoiseGrid(NamedTuple):
