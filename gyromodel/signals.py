@@ -93,8 +93,8 @@ def _blocks(campaign: Campaign, time: np.ndarray) -> tuple[np.ndarray, str]:
             numbers = np.unique(values, return_inverse=True)[1]
             if 4 <= numbers.max() + 1 <= 60:
                 return numbers, f"{name}s"
-    parts = (np.arange(len(time)) * 6) // len(time)
-    return parts, "sixths of the record"
+    parts = (np.arange(len(time)) * 5) // len(time)
+    return parts, "fifths of the record"
 
 
 def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:

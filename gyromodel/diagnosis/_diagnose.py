@@ -17,6 +17,7 @@ from gyromodel.diagnosis._result import Candidate, Diagnosis, Gain, Round
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import (
     Found,
+    NoisePath,
     Progress,
     Ranking,
     Selection,
@@ -32,12 +33,12 @@ from gyromodel.estimate import Estimate, fit_record
 from gyromodel.model import GyroModel, record_span
 from gyromodel.noise import NoiseGrid, NoiseRatios, noise_grid
 from gyromodel.signals import Record, read_signals
-from gyromodel.units import convertible, factor
+from gyromodel.units import convertible, factor, from_internal
 
 # ln of the evidence ratio that no noise in or near the family reaches once in a hundred campaigns.
 SAFE_THRESHOLD = 5.0
 # Folds search the noise cells within this many nats of the best of the main pass.
-FOLD_NEARBY = 5.0
+FOLD_NEARBY = 3.0
 
 
 class _Session:
@@ -54,9 +55,9 @@ class _Session:
             self._ladder[id(estimate)] = ladder_error(estimate.record, estimate)
         return self._ladder[id(estimate)]
 
-    def run(self, baseline: Estimate, progress: Progress = None) -> Selection:
+    def run(self, baseline: Estimate, progress: Progress = None, noise: NoisePath = ()) -> Selection:
         """The rounds."""
-        return search(self.record, self.scanner, baseline, self.threshold, progress=progress)
+        return search(self.record, self.scanner, baseline, self.threshold, progress=progress, noise=noise)
 
     def run_and_prune(self, baseline: Estimate, progress: Progress = None) -> Selection:
         """The rounds, cut where (after the first step) the error on blocks left out stops falling."""
@@ -126,7 +127,6 @@ def diagnose(
     heavy = tails(selection.estimate)
     findings += [heavy] if heavy else []
     say("judging", 0.65)
-    judgement = judge(record, session.scanner, baseline, selection, len(bank.names()), nulls)
     unit = _rate_unit(campaigns[0])
     scale = factor("rad/s", unit)
     ordinary = tuple(hold_out and session.ladder(e)[2] for e in (baseline, selection.estimate))
@@ -137,11 +137,15 @@ def diagnose(
         )
     final = selection.estimate
     extended = fit_record(final.record, final.model_as_given(), intervals=True, ordinary=ordinary[1])
+    judgement = judge(record, session.scanner, baseline, selection, extended, len(bank.names()), nulls)
     gain = not_measured(unit) if not hold_out else _gain(session, baseline, selection, unit, scale, ordinary, say)
     driver = driver_shape(session.scanner, selection, judgement.driver, unit) if judgement.driver else None
     say("done", 1.0)
     whole = shortened[0][0] if len(shortened) == 1 else _together([c for c, _ in shortened])
     before, after = (np.asarray(e.model.predict(record.signals))[: record.rows] for e in (baseline, extended))
+    output_unit = campaigns[0].units["output"]
+    if campaigns[0].metadata["kind"] != "rate":
+        output_unit = f"{output_unit}/s"
     output = np.where(record.present, np.asarray(record.signals["output"])[: record.rows], np.nan)
     return Diagnosis(
         verdict=judgement.verdict,
@@ -160,8 +164,8 @@ def diagnose(
         threshold_kind="calibrated" if calibrate else "safe",
         searched=bank.names(),
         campaign=whole,
-        predicted_before=before,
-        predicted_after=after,
+        predicted_before=from_internal(before, output_unit),
+        predicted_after=from_internal(after, output_unit),
         residual_before=(output - before) / float(baseline.model.gain()) * scale,
         residual_after=(output - after) / float(extended.model.gain()) * scale,
         rate_unit=unit,
@@ -194,12 +198,13 @@ def _gain(session: _Session, baseline: Estimate, selection: Selection, unit: str
         return no_gain(session.record, baseline, unit, scale)
 
     rankings = [f.ranking for f in selection.path] + [selection.last]
+    noise = [e.ratios for e in selection.estimates]
     cells = sorted({g for ranking in rankings for g in cells_of_weight(ranking, FOLD_NEARBY)})
 
     def select(record: Record, base: Estimate) -> Estimate:
         fold = _Session(record, session.bank, session.grid, session.threshold, base.noise_given)
         fold.scanner.only_cells = cells
-        return fold.run(base).estimate
+        return fold.run(base, noise=noise).estimate
 
     return nested_gain(
         session.record,

@@ -81,7 +81,7 @@ def nested_gain(
     ordinary: tuple[bool, bool],
     progress: Callable[[int, int], None] | None = None,
 ) -> Gain:
-    """Gain on blocks that neither fit nor selection saw.
+    """Gain on blocks that neither the parameters nor the selection saw; noise ratios are those of the whole record.
 
     Args:
         record: the data.
@@ -96,7 +96,7 @@ def nested_gain(
     blocks = blocks_of(record)
     for k, rows in enumerate(blocks):
         try:
-            base = fit_record(record.without(rows), baseline.model_as_given())
+            base = fit_record(record.without(rows), baseline.model_as_given(), ratios=baseline.ratios)
             extended = select(record.without(rows), base)
             e0, s0 = _errors(record, base, rows, ordinary[0])
             e1, s1 = _errors(record, extended, rows, ordinary[1])

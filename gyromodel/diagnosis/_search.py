@@ -14,13 +14,15 @@ from gyromodel.effects import Effect
 from gyromodel.effects.drivers import BiasPeriodic, BiasStep
 from gyromodel.estimate import Estimate, EstimateError, fit_record
 from gyromodel.model import GyroModel
+from gyromodel.noise import NoiseRatios
 from gyromodel.signals import Record
 
 Progress = Callable[[str, float], None] | None
+NoisePath = Sequence[NoiseRatios]
 
 MAXIMUM_ROUNDS = 12
 # Cells within this many nats of the best, for any candidate, get their neighbours searched too.
-NEARBY = 10.0
+NEARBY = 7.0
 # An earlier choice is exchanged when another candidate beats it by this many nats given all the others.
 EXCHANGE = 2.0
 # Functions of time that one run cannot tell from a random walk, and the lead (nats) over it at which they are put
@@ -174,6 +176,7 @@ def search(
     *,
     progress: Progress = None,
     rounds: int = MAXIMUM_ROUNDS,
+    noise: NoisePath = (),
 ) -> Selection:
     """Add candidates until nothing more is significant.
 
@@ -184,6 +187,7 @@ def search(
         threshold: least ln evidence ratio of an addition.
         progress: called with a line and the fraction done.
         rounds: at most this many additions.
+        noise: noise ratios to hold in the fits, see `refit`.
     """
     path: list[Found] = []
     estimates = [baseline]
@@ -197,7 +201,7 @@ def search(
         if score < threshold and not _slow_structure(ranking, name, score, threshold):
             break
         step = _addition(scanner, estimate, ranking, name, pulses)
-        after = refit(record, baseline, standing([*path, step]))
+        after = refit(record, baseline, standing([*path, step]), noise)
         if after is None:
             break
         if progress:
@@ -214,7 +218,7 @@ def search(
         return Selection(baseline, (), (), path[0].ranking, (baseline,), driver)
     found = standing(path)
     if sum(f.effect is not None for f in found) > 1:
-        found, estimates[-1] = _exchange(record, scanner, baseline, found, estimates[-1], threshold)
+        found, estimates[-1] = _exchange(record, scanner, baseline, found, estimates[-1], threshold, noise)
     driver, score = ranking.best(drivers=True)
     driver = driver if score >= threshold else None
     return Selection(estimates[-1], tuple(found), tuple(path), ranking, tuple(estimates), driver)
@@ -290,8 +294,16 @@ def _solved(scanner: Scanner, estimate: Estimate, effect: Effect, g: int, pulses
     return effect.with_linear(jnp.asarray(coefficients))
 
 
-def refit(record: Record, baseline: Estimate, found: list[Found]) -> Estimate | None:
-    """Fit the baseline with everything found; shape parameters that cannot be estimated stay at the searched value."""
+def refit(record: Record, baseline: Estimate, found: list[Found], noise: NoisePath = ()) -> Estimate | None:
+    """Fit the baseline with everything found; shape parameters that cannot be estimated stay at the searched value.
+
+    Args:
+        record: the data.
+        baseline: the fitted simulation.
+        found: what to add to it.
+        noise: ratios to hold, by the number of additions (the last for more); none: estimate them.
+    """
+    ratios = noise[min(len(found), len(noise) - 1)] if noise else None
     model = baseline.model
     given = baseline.noise_given and not any(f.frees_noise for f in found)
     for step in found:
@@ -302,7 +314,7 @@ def refit(record: Record, baseline: Estimate, found: list[Found]) -> Estimate | 
     model = GyroModel(model.effects, baseline.model.noise if given else {}, model.fixed, model.gyro)
     for attempt in (model, _shapes_held(model, found)):
         try:
-            return fit_record(data, attempt)
+            return fit_record(data, attempt, ratios=ratios)
         except EstimateError:
             continue
     return None
@@ -324,10 +336,12 @@ def replace_fixed(model: GyroModel, fixed: frozenset[tuple[str, str]]) -> GyroMo
     return GyroModel(model.effects, model.noise, fixed, model.gyro)
 
 
-def leave_one_out(record: Record, scanner: Scanner, baseline: Estimate, found: list[Found], i: int) -> Ranking | None:
+def leave_one_out(
+    record: Record, scanner: Scanner, baseline: Estimate, found: list[Found], i: int, noise: NoisePath = ()
+) -> Ranking | None:
     """Rank all candidates beside everything found except item i."""
     others = found[:i] + found[i + 1 :]
-    estimate = refit(record, baseline, others)
+    estimate = refit(record, baseline, others, noise)
     if estimate is None:
         return None
     pulses = tuple(r for f in others for r in f.rows)
@@ -335,13 +349,19 @@ def leave_one_out(record: Record, scanner: Scanner, baseline: Estimate, found: l
 
 
 def _exchange(
-    record: Record, scanner: Scanner, baseline: Estimate, found: list[Found], estimate: Estimate, threshold: float
+    record: Record,
+    scanner: Scanner,
+    baseline: Estimate,
+    found: list[Found],
+    estimate: Estimate,
+    threshold: float,
+    noise: NoisePath,
 ) -> tuple[list[Found], Estimate]:
     """Re-choose each earlier addition given all the others."""
     for i in range(len(found)):
         if found[i].effect is None:
             continue
-        ranking = leave_one_out(record, scanner, baseline, found, i)
+        ranking = leave_one_out(record, scanner, baseline, found, i, noise)
         if ranking is None:
             continue
         name, score = ranking.best(drivers=False)
@@ -354,12 +374,12 @@ def _exchange(
         ):
             continue
         others = found[:i] + found[i + 1 :]
-        base = refit(record, baseline, others)
+        base = refit(record, baseline, others, noise)
         if base is None:
             continue
         step = _addition(scanner, base, ranking, name, tuple(r for f in others for r in f.rows))
         changed = [*others[:i], step, *others[i:]]
-        after = refit(record, baseline, changed)
+        after = refit(record, baseline, changed, noise)
         if after is not None:
             found, estimate = changed, after
     return found, estimate

@@ -75,7 +75,13 @@ def _coloured(ranking: Ranking) -> bool:
 
 
 def judge(
-    record: Record, scanner: Scanner, baseline: Estimate, selection: Selection, trials: int, null_scores: np.ndarray
+    record: Record,
+    scanner: Scanner,
+    baseline: Estimate,
+    selection: Selection,
+    extended: Estimate,
+    trials: int,
+    null_scores: np.ndarray,
 ) -> Judgement:
     """The verdict on a finished search."""
     found = list(selection.found)
@@ -95,7 +101,7 @@ def judge(
                 some = ", ".join(str(r + 1) for r in step.rows[:8])
                 findings.append(f"Gross error in data row {some}: given up, not modelled.")
                 continue
-        causes.append(_cause(scanner, selection.estimate, step, ranking, members, statistic, trials, null_scores))
+        causes.append(_cause(scanner, extended, step, ranking, members, statistic, trials, null_scores))
         sets.append(members)
     order = sorted(range(len(causes)), key=lambda i: -causes[i].statistic)
     causes, sets = [causes[i] for i in order], [sets[i] for i in order]

@@ -1,0 +1,224 @@
+"""The noise family against its definitions (PSDs and Allan variances of the noise table), the restricted likelihood
+against its dense formula, and estimates against simulators that share no code with the package (tests/truth/noise.py)."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import binom, norm
+
+from gyromodel.campaign import Campaign
+from gyromodel.estimate import fit_record
+from gyromodel.model import model_from_effects
+from gyromodel.noise import NoiseRatios, coefficients, markov_sum, noise_grid, restricted_likelihood
+from gyromodel.numerics.state_space import Sampling
+from gyromodel.signals import Record, read_signals
+from tests.test_state_space import covariance
+from tests.truth import noise as truth
+from tests.truth.designs import Design
+
+ROWS, STEP = 256, 20.0
+RARE = 1e-5  # chance that right code fails one statistical check
+SEEDS = 40
+
+
+def sampling(rows: int, step: float = 1.0) -> Sampling:
+    return Sampling(jnp.full(rows, step), jnp.arange(rows) == 0, jnp.ones(rows, bool), jnp.ones(rows))
+
+
+def allan_variance(matrix: np.ndarray, m: int) -> float:
+    """Of samples averaged over m, from their covariance, at the middle of the record."""
+    start = len(matrix) // 2 - m
+    weights = np.zeros(len(matrix))
+    weights[start : start + m], weights[start + m : start + 2 * m] = -1 / m, 1 / m
+    return 0.5 * weights @ matrix @ weights
+
+
+@pytest.mark.parametrize("samples", [100, 1000, 10**4, 10**6])
+def test_flicker_spectrum_is_one_over_f_within_its_ripple(samples: int):
+    """Terms of time constants at ratio ρ ripple by ±2 sech(π²/ln ρ) about the same terms without gaps between them."""
+    interval, span, flicker = 0.5, 0.5 * samples, 3.0
+    noise = markov_sum(NoiseRatios(jnp.asarray(flicker), jnp.asarray(0.0)), interval, span)
+    decay, variance = (np.asarray(x)[1:] for x in noise)
+    omega = np.geomspace(1 / span, 1 / interval, 500)
+    spectrum = (2 * variance / decay / (1 + (omega[:, None] / decay) ** 2)).sum(axis=1)
+    spacing = np.log(samples) / (len(decay) - 1)
+    edge = np.exp(spacing / 2)
+    ends = np.arctan(omega * span * edge) - np.arctan(omega * interval / edge)
+    ripple = 2 / np.cosh(np.pi**2 / spacing)
+    assert spectrum == pytest.approx(flicker / omega * (2 / np.pi) * ends, rel=1.05 * ripple + 0.01)
+    inside = (omega > 10 / span) & (omega < 0.1 / interval)
+    assert (spectrum * omega / flicker)[inside] == pytest.approx(1.0, abs=ripple + 0.11)
+
+
+def test_state_space_noise_has_the_allan_variances_of_the_table():
+    rows, step, q = 512, 0.5, 2.0
+    steps = np.array([4, 8, 16, 32, 64])
+    white = np.eye(rows) * q**2
+    N = float(coefficients(NoiseRatios(np.zeros(()), np.zeros(())), q**2, step)["noise_white"])
+    assert [allan_variance(white, m) for m in steps] == pytest.approx(N**2 / (steps * step))
+
+    def coloured(flicker: float, walk: float) -> np.ndarray:
+        ratios = NoiseRatios(jnp.asarray(flicker), jnp.asarray(walk))
+        return (covariance(markov_sum(ratios, step, rows * step), sampling(rows, step)) - np.eye(rows)) * q**2
+
+    K = float(coefficients(NoiseRatios(np.zeros(()), np.asarray(0.3)), q**2, step)["noise_random_walk"])
+    expected = K**2 * steps * step / 3 * (1 + 0.5 / steps**2)  # of samples, not of means
+    assert [allan_variance(coloured(0.0, 0.3), m) for m in steps] == pytest.approx(expected)
+    B = float(coefficients(NoiseRatios(np.asarray(0.3), np.zeros(())), q**2, step)["noise_flicker"])
+    found = np.array([allan_variance(coloured(0.3, 0.0), m) for m in steps])
+    assert found == pytest.approx(2 * np.log(2) / np.pi * B**2, rel=0.06)
+
+
+def design(rows: int) -> Design:
+    index = np.arange(rows)
+    return Design("static", STEP, index, {}, {}, {}, {}, (index, index))
+
+
+def test_state_space_noise_has_the_increments_of_the_independent_one():
+    """Variance of differences over many lags: exact for a walk; flicker by other means, so not to the last digit."""
+    B, K, lags = 3.0, 0.2, np.array([5, 10, 20, 40, 80])
+    for law, ratios, close in (
+        (truth.Noise("walk", 0.0, {2.0: K}), NoiseRatios(jnp.asarray(0.0), jnp.asarray(K**2 * STEP)), 1e-9),
+        (truth.Noise("flicker", 0.0, {1.0: B}), NoiseRatios(jnp.asarray(B**2), jnp.asarray(0.0)), 0.06),
+    ):
+        expected = law.covariance(design(ROWS))
+        matrix = covariance(markov_sum(ratios, STEP, ROWS * STEP), sampling(ROWS, STEP)) - np.eye(ROWS)
+        middle = ROWS // 3
+        for total, other in ((matrix, expected),):
+            a = total[middle, middle] + np.diag(total)[middle + lags] - 2 * total[middle, middle + lags]
+            b = other[middle, middle] + np.diag(other)[middle + lags] - 2 * other[middle, middle + lags]
+            assert a == pytest.approx(b, rel=close)
+
+
+def test_coefficients_are_input_rates():
+    """One sample of variance 4 (rad/s)² each 25 s; ratios 0.09 and 0.01."""
+    found = coefficients(NoiseRatios(np.asarray(0.09), np.asarray(0.01)), 4.0, 25.0)
+    assert found == pytest.approx({"noise_white": 10.0, "noise_flicker": 0.6, "noise_random_walk": 0.04})
+
+
+@pytest.mark.parametrize("samples", [41, 256, 3000])
+def test_noise_cells_reach_from_invisible_to_dominant(samples: int):
+    grid = noise_grid(samples, 0.5, 0.5 * samples)
+    prior = np.exp(grid.log_prior)
+    flicker, walk = (np.asarray(r) for r in grid.ratios)
+    assert prior.sum() == pytest.approx(1.0)
+    assert prior[flicker == 0].sum() == pytest.approx(0.5)
+    assert prior[walk == 0].sum() == pytest.approx(0.5)
+    # At the record's length: white variance 1/n against B² and K²·n steps/3.
+    assert flicker[flicker > 0].min() < 1 / samples
+    assert walk[walk > 0].min() * samples / 3 < 2 / samples
+    assert flicker.max() >= 10
+    assert walk.max() >= 3
+    for levels in (np.unique(flicker)[1:], np.unique(walk)[1:]):
+        assert (levels[1:] / levels[:-1]).max() < 10.0  # half a decade of amplitude
+
+
+def test_few_samples_have_white_noise():
+    grid = noise_grid(30, 1.0, 30.0)
+    assert np.array_equal(grid.ratios.flicker, [0.0])
+    assert np.array_equal(grid.ratios.walk, [0.0])
+
+
+@pytest.mark.parametrize("parameters", [0, 1, 3])
+def test_restricted_likelihood_is_the_dense_formula(parameters: int, rng: np.random.Generator):
+    rows, cells, span = 80, 37, 90.0
+    present = rng.random(rows) < 0.8
+    restart = np.isin(np.arange(rows), [0, 50])
+    laid = Sampling(
+        *(jnp.asarray(x) for x in (rng.uniform(0.5, 2.0, rows), restart, present, rng.uniform(0.5, 2, rows)))
+    )
+    ratios = NoiseRatios(*(jnp.asarray(10.0 ** rng.uniform(-3, 1, cells)) for _ in range(2)))
+    matrix = rng.standard_normal((rows, parameters)) * np.geomspace(1e-6, 1e3, parameters or 1)[:parameters]
+    residual = rng.standard_normal(rows)
+    result = restricted_likelihood(ratios, 1.0, span, laid, jnp.asarray(matrix), jnp.asarray(residual))
+    x, r = matrix[present], residual[present]
+    for k in range(cells):
+        cell = NoiseRatios(ratios.flicker[k], ratios.walk[k])
+        total = covariance(markov_sum(cell, 1.0, span), laid)[np.ix_(present, present)]
+        weight = np.linalg.inv(total)
+        scale = np.abs(x).max(axis=0, initial=1e-300)
+        information = (x / scale).T @ weight @ (x / scale)
+        fitted = (x / scale) @ np.linalg.solve(information, (x / scale).T @ weight @ r)
+        rss = (r - fitted) @ weight @ (r - fitted)
+        nu = len(r) - parameters
+        log_information = np.linalg.slogdet(information)[1] + 2 * np.log(scale).sum()
+        expected = -0.5 * np.linalg.slogdet(total)[1] - 0.5 * log_information - 0.5 * nu * np.log(rss)
+        assert result.log_likelihood[k] == pytest.approx(expected, rel=1e-9)
+        assert result.residual_sum[k] == pytest.approx(rss, rel=1e-9)
+    assert result.degrees_of_freedom == nu
+
+
+def with_output(record: Record, values: np.ndarray) -> Record:
+    return record._replace(signals=record.signals | {"output": jnp.asarray(values)})
+
+
+def static(rng: np.random.Generator) -> Record:
+    units = {"time": "s", "output": "rad/s"}
+    columns = {"time": np.arange(ROWS) * STEP, "output": rng.standard_normal(ROWS)}
+    return read_signals(Campaign(columns, units, {"kind": "rate"}))
+
+
+def test_intervals_cover_independently_simulated_noise(rng: np.random.Generator):
+    """N, B and K of white, flicker, random walk and both, levels as in a real gyro: 95 % by the binomial law."""
+    record, model = static(rng), model_from_effects(["bias"])
+    ids = {"noise_white": None, "noise_flicker": 1.0, "noise_random_walk": 2.0}
+    inside: dict[str, list[bool]] = defaultdict(list)
+    ratio: dict[str, list[float]] = defaultdict(list)
+    reach: dict[str, list[float]] = defaultdict(list)
+    for seed in range(SEEDS):
+        law = truth.draw(truth.FAMILY[seed % 4], design(ROWS), rng)
+        estimate = fit_record(with_output(record, law.sample(design(ROWS), rng)), model, intervals=True)
+        for name, alpha in ids.items():
+            level = law.white if alpha is None else law.fractional.get(alpha, 0.0)
+            low, high = estimate.noise_interval[name]
+            value = float(estimate.model.noise[name])
+            assert low * (1 - 1e-9) <= value <= high * (1 + 1e-9)
+            inside[name].append(low <= level <= high)
+            if level:
+                ratio[name].append(value / level)
+                reach[name].append(high / level)
+    for name, hits in inside.items():
+        assert binom.cdf(sum(hits), len(hits), 0.95) > RARE, (name, sum(hits))
+    assert np.median(ratio["noise_white"]) == pytest.approx(1.0, abs=0.1)
+    for name in ("noise_flicker", "noise_random_walk"):
+        assert 0.4 < np.median(ratio[name]) < 1.7, ratio[name]
+        assert np.median(reach[name]) < 4.0, reach[name]
+
+
+def test_white_noise_shows_no_other(rng: np.random.Generator):
+    """The interval of what is absent begins at zero and ends below what a record of this length would show."""
+    record, model = static(rng), model_from_effects(["bias"])
+    N = 1e-6
+    shown = 0
+    for _ in range(12):
+        output = truth.white(ROWS, STEP, N, rng)
+        estimate = fit_record(with_output(record, output), model, intervals=True)
+        low = [estimate.noise_interval[name][0] for name in ("noise_flicker", "noise_random_walk")]
+        shown += max(low) > 0
+        assert estimate.noise_interval["noise_flicker"][1] < N / np.sqrt(STEP)
+        assert float(estimate.model.noise["noise_white"]) == pytest.approx(
+            N, rel=norm.isf(RARE) / np.sqrt(2 * ROWS) + 0.1
+        )
+    assert binom.sf(shown - 1, 12, 0.05) > RARE
+
+
+@pytest.mark.parametrize(("kind", "other"), [("flicker", "noise_random_walk"), ("random_walk", "noise_flicker")])
+def test_strong_noise_is_told_by_its_colour(kind: str, other: str, rng: np.random.Generator):
+    """One hundred times the white variance at the record's length."""
+    record, model = static(rng), model_from_effects(["bias"])
+    N, share = 1e-6, []
+    for _ in range(8):
+        coloured = truth.flicker(ROWS, STEP, 2 * N / np.sqrt(STEP), rng)
+        if kind == "random_walk":
+            coloured = truth.random_walk(ROWS, STEP, 0.5 * N / STEP, rng)
+        estimate = fit_record(with_output(record, coloured + truth.white(ROWS, STEP, N, rng)), model)
+        at_length = {  # Allan deviations at a quarter of the record
+            "noise_flicker": 0.664 * float(estimate.model.noise["noise_flicker"]),
+            "noise_random_walk": float(estimate.model.noise["noise_random_walk"]) * np.sqrt(ROWS * STEP / 4 / 3),
+        }
+        share.append(at_length[f"noise_{kind}"] / (at_length[other] + at_length[f"noise_{kind}"]))
+    assert np.median(share) > 0.5, share
