@@ -94,9 +94,11 @@ def number(value: float, digits: int = 2, power: int | None = None) -> str:
 
 
 def pair(first: float, second: float) -> tuple[str, str]:
-    """Two values to compare: with one power of ten, and as many digits (two to four) as make them differ."""
+    """Two values to compare: with one power of ten unless they lie far apart, and two to four digits, to differ."""
     values = [v for v in (first, second) if math.isfinite(v) and v != 0.0]
     exponents = [_exponent(float(f"{v:.1e}")) for v in values]
+    if exponents and max(exponents) - min(exponents) > 1:
+        return number(first), number(second)
     power = max(exponents) if exponents and min(exponents) < -3 else None
     for digits in (2, 3, 4):
         shown = number(first, digits, power), number(second, digits, power)

@@ -111,7 +111,7 @@ def _lacks(causes: Sequence[Cause]) -> str:
 def _with_size(cause: Cause) -> str:
     """The cause with its size; a curve of many coefficients is named without them."""
     values = [p for p in cause.parameters if math.isfinite(p.value) and p.std != 0.0]
-    if len(values) > 3:
+    if any("[" in p.name for p in values):
         return phrase(cause.effect)
     if len(values) == 1:
         return f"{phrase(cause.effect)} of {with_uncertainty(values[0].value, values[0].std, values[0].unit)}"
