@@ -133,6 +133,13 @@ class GyroModel(eqx.Module):
         gain, rate, scale = self._sites(signals)
         return gain * rate * scale
 
+    def slope(self, signals: Signals) -> Float[Array, " sample"]:
+        """Derivative of the output by the input rate at each sample: what turns an output error into a rate error."""
+        if "rate" not in signals:
+            return jnp.full_like(signals["time"], self.gain())
+        rate = signals["rate"]
+        return jax.jvp(lambda r: self.predict({**signals, "rate": r}), (rate,), (jnp.ones_like(rate),))[1]
+
     def columns_of(self, effect: Effect, signals: Signals) -> Float[Array, "sample coefficient"]:
         """Derivative of the output by an effect's linear coefficients, as it stands in this model or were it added."""
         gain, rate, scale = self._sites(signals)

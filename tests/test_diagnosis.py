@@ -210,3 +210,16 @@ def test_noise_that_the_model_does_not_state_is_a_cause(rng: np.random.Generator
     assert "noise_random_walk" in found.credible_set
     quiet = gm.diagnose(static_log(rng), stated(gm.model_from_effects(["bias"])), hold_out=False)
     assert quiet.verdict == "adequate"
+
+
+def test_slope_is_the_derivative_by_rate() -> None:
+    rate = np.linspace(-2.0, 2.0, 64)
+    signals = {"time": jnp.arange(64.0), "rate": jnp.asarray(rate)}
+    model = gm.model_from_effects(["scale_factor", "bias", "scale_sagnac_sine"])
+    model = model.with_vector(jnp.array([1000.0, 0.01, 0.4]))
+    # output = S0 (rate + b) sin(κ rate)/(κ rate)
+    expected = 1000 * (
+        np.sin(0.4 * rate) / (0.4 * rate)
+        + (rate + 0.01) * (np.cos(0.4 * rate) / rate - np.sin(0.4 * rate) / (0.4 * rate**2))
+    )
+    assert np.asarray(model.slope(signals)) == pytest.approx(expected, rel=1e-9)

@@ -83,7 +83,7 @@ def test_state_space_noise_has_the_allan_variances_of_the_independent_one():
     B, K, steps = 3.0, 0.2, (4, 8, 16, 32, 64)
     for law, ratios, close in (
         (truth.Noise("walk", 0.0, {2.0: K}), NoiseRatios(jnp.asarray(0.0), jnp.asarray(K**2 * STEP)), 1e-9),
-        (truth.Noise("flicker", 0.0, {1.0: B}), NoiseRatios(jnp.asarray(B**2), jnp.asarray(0.0)), 0.15),
+        (truth.Noise("flicker", 0.0, {1.0: B}), NoiseRatios(jnp.asarray(B**2), jnp.asarray(0.0)), 0.2),
     ):
         other = law.covariance(design(ROWS))
         own = covariance(markov_sum(ratios, STEP, ROWS * STEP), sampling(ROWS, STEP)) - np.eye(ROWS)

@@ -143,6 +143,7 @@ def diagnose(
     say("done", 1.0)
     whole = shortened[0][0] if len(shortened) == 1 else _together([c for c, _ in shortened])
     before, after = (np.asarray(e.model.predict(record.signals))[: record.rows] for e in (baseline, extended))
+    slopes = [np.asarray(e.model.slope(record.signals))[: record.rows] for e in (baseline, extended)]
     output_unit = campaigns[0].units["output"]
     if campaigns[0].metadata["kind"] != "rate":
         output_unit = f"{output_unit}/s"
@@ -166,8 +167,8 @@ def diagnose(
         campaign=whole,
         predicted_before=from_internal(before, output_unit),
         predicted_after=from_internal(after, output_unit),
-        residual_before=(output - before) / float(baseline.model.gain()) * scale,
-        residual_after=(output - after) / float(extended.model.gain()) * scale,
+        residual_before=(output - before) / slopes[0] * scale,
+        residual_after=(output - after) / slopes[1] * scale,
         rate_unit=unit,
         baseline=baseline,
         extended=extended,

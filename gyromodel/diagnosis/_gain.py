@@ -26,11 +26,11 @@ def blocks_of(record: Record) -> list[np.ndarray]:
 def held_out(record: Record, train: Estimate, rows: np.ndarray) -> tuple[np.ndarray, float]:
     """Errors of a block (as a rate) by a model fitted without it, and its log score given the other blocks' noise."""
     predicted = np.asarray(train.model.predict(record.signals))
-    gain = float(train.model.gain())
+    slope = np.asarray(train.model.slope(record.signals))
     residual = np.asarray(record.signals["output"]) - predicted
     with_block = _log_density(record, residual, train)
     without = _log_density(record.without(rows), residual, train)
-    return residual[rows] / gain, with_block - without
+    return residual[rows] / slope[rows], with_block - without
 
 
 def _log_density(record: Record, residual: np.ndarray, estimate: Estimate) -> float:
