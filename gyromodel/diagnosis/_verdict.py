@@ -101,6 +101,8 @@ def judge(
                 some = ", ".join(str(r + 1) for r in step.rows[:8])
                 findings.append(f"Gross error in data row {some}: given up, not modelled.")
                 continue
+        close = _close_rival(step, members)
+        findings += [close] if close else []
         causes.append(_cause(scanner, extended, step, ranking, members, statistic, trials, null_scores))
         sets.append(members)
     order = sorted(range(len(causes)), key=lambda i: -causes[i].statistic)
@@ -133,6 +135,19 @@ def judge(
                 f"{others}."
             )
     return Judgement("named", named, sets[0], None, None, unexplained, tuple(findings))
+
+
+def _close_rival(step: Found, members: dict[str, float]) -> str | None:
+    """A sentence where another name was nearly as likely when this one was added, and a later step ruled it out."""
+    statistic = step.ranking.statistic
+    rivals = {k: v for k, v in statistic.items() if k not in (step.name, "outliers") and not is_driver(k)}
+    rival = max(rivals, key=lambda k: rivals[k], default=None)
+    if rival is None or rival in members or step.name in _supersedes(rival) or rival in _supersedes(step.name):
+        return None
+    lead = statistic.get(step.name, np.inf) - rivals[rival]
+    if not 0 <= lead < -np.log(1.0 / CREDIBLE - 1.0):
+        return None
+    return f"When it was added, {step.name} led {rival} by {lead:.1f} nats only; later terms took {rival} out of the race."
 
 
 def _as_set(cause: Cause, members: dict[str, float]) -> tuple[Cause, ...]:
