@@ -15,7 +15,7 @@ from gyromodel.campaign import Campaign
 from gyromodel.effects import CATALOGUE, Effect, Signals
 from gyromodel.effects._base import evaluate
 from gyromodel.effects.drivers import BiasColumn
-from gyromodel.noise import NoiseRatios, markov_sum
+from gyromodel.noise import NOISE_UNITS, NoiseRatios, markov_sum
 from gyromodel.numerics.state_space import build_filter, colour
 from gyromodel.signals import Record, read_signals
 from gyromodel.units import convertible, from_internal
@@ -53,6 +53,9 @@ class GyroModel(eqx.Module):
         twice = {x for x in labels if labels.count(x) > 1} - {"bias_periodic", "bias_step"}
         if twice:
             raise ModelError(f"the model lists {min(twice)} twice; keep one")
+        unknown = set(self.noise) - set(NOISE_UNITS)
+        if unknown:
+            raise ModelError(f"unknown noise {min(unknown)}; known are {', '.join(NOISE_UNITS)}")
 
     @property
     def labels(self) -> tuple[str, ...]:

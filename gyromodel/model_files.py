@@ -115,15 +115,17 @@ def read_model(path: str | Path) -> GyroModel:
     top = place.mapping(("gyro", "effects", "noise", *RECORD_KEYS), "a model")
     if "effects" not in top:
         raise place.error("the model lists no effects")
-    effects, fixed = [], set()
+    effects: list[Effect] = []
+    fixed: dict[str, set[tuple[str, str]]] = {}
     for item in top["effects"].items("effects"):
         effect, known = _read_effect(item)
         effects.append(effect)
-        fixed |= known
+        if fixed.setdefault(effect.label, known) != known:
+            raise item.error(f"of several {effect.label} all have the same parameters fixed, or none")
     noise = _read_noise(top["noise"]) if "noise" in top else {}
     gyro = top["gyro"].text() if "gyro" in top else ""
     try:
-        return GyroModel(tuple(effects), noise, frozenset(fixed), gyro)
+        return GyroModel(tuple(effects), noise, frozenset().union(*fixed.values()), gyro)
     except ModelError as problem:
         raise top["effects"].error(str(problem)) from None
 

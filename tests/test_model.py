@@ -125,6 +125,11 @@ def test_an_effect_comes_once_except_steps_and_lines():
         steps.without("bias_drift")
 
 
+def test_unknown_noise_is_named():
+    with pytest.raises(ModelError, match="unknown noise noise_pink; known are noise_white, noise_flicker, noise_random"):
+        GyroModel((), {"noise_white": 1.0, "noise_pink": 1.0})
+
+
 def test_unknown_effects_and_missing_columns_are_named(rng: np.random.Generator):
     for label in ("bias_column", "bias_", "thermal_bias", ""):
         with pytest.raises(ModelError, match=r"unknown effect .*; the catalogue has bias, bias_drift"):

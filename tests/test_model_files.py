@@ -343,6 +343,7 @@ BAD = [
     (entry("{effect: scale_spline, knots: 2}"), 4, "scale_spline: "),
     (entry("{effect: scale_spline, knots: 1000000000}"), 4, "whole numbers below 100"),
     (entry("{effect: scale_spline, knots: 6.5}"), 4, "whole numbers"),
+    ("effects:\n  - {effect: bias_step, fixed: true}\n  - effect: bias_step\n", 3, "of several bias_step all have"),
     ("effects: []\nnoise: loud\n", 2, "noise is"),
     ("effects: []\nnoise: []\n", 2, "needs a noise_white above zero"),
     ("effects: []\nnoise:\n  - {effect: noise_flicker, value: 1 deg/h}\n", 3, "needs a noise_white above zero"),

@@ -147,7 +147,7 @@ def _close_rival(step: Found, members: dict[str, float]) -> str | None:
     lead = statistic.get(step.name, np.inf) - rivals[rival]
     if not 0 <= lead < -np.log(1.0 / CREDIBLE - 1.0):
         return None
-    return f"When it was added, {step.name} led {rival} by {lead:.1f} nats only; later terms took {rival} out of the race."
+    return f"When it was added, {step.name} led {rival} by {lead:.1f} nats only; later terms ruled {rival} out."
 
 
 def _as_set(cause: Cause, members: dict[str, float]) -> tuple[Cause, ...]:
