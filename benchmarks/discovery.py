@@ -117,7 +117,7 @@ def main(argv: list[str] | None = None) -> None:
     sized = {}
     for k, size in enumerate((1.0, 3.0, 10.0)):
         cases = study.effect_cases(args.effects, args.seed + 10 + k, size, FAMILY)
-        sized[size] = run(f"effects at {size:g} x MDE", cases, controls=args.controls and size == 3.0)
+        sized[size] = run(f"effects at {size:g} x MDE", cases, controls=args.controls and size == 3.0, gain=size == 3.0)
     unknown = []
     for k, size in enumerate((3.0, 10.0)):
         unknown += run(
@@ -128,7 +128,7 @@ def main(argv: list[str] | None = None) -> None:
 
     effects = [r for records in sized.values() for r in records]
     levels = study.null_levels(nulls + outside) + study.effect_levels(effects) + study.unknown_levels(unknown)
-    levels += [*study.ambiguity_levels(inseparable, drifts), study.gain_coverage(sized[3.0] + sized[10.0])]
+    levels += [*study.ambiguity_levels(inseparable, drifts), study.gain_coverage(sized[3.0])]
     levels.sort(key=lambda v: (float(v.row.rstrip("+")), v.measure))
     everything = [*nulls, *outside, *effects, *unknown, *inseparable, *drifts]
     seconds = [r.answer.seconds for r in everything if r.answer]

@@ -404,7 +404,7 @@ def test_a_breakpoint_is_found(rng: np.random.Generator):
 
 compilations: list[float] = []
 jax.monitoring.register_event_duration_secs_listener(
-    lambda name, seconds, **_: compilations.append(seconds) if "backend_compile" in name else None
+    lambda event, duration_secs, **_: compilations.append(duration_secs) if "backend_compile" in event else None
 )
 
 

@@ -93,8 +93,8 @@ def load(folder: Path, name: str) -> Problem:
         [re.findall(r"[-+.\dEe]+", line.split("=")[1]) for line in re.findall(r"(?m)^ *b\d+ *=.*$", text)], float
     )
     data = np.array([line.split() for line in text[text.rindex("Data:") :].splitlines()[1:] if line.strip()], float)
-    y = np.log(data[:, 0]) if name == "Nelson" else data[:, 0]
-    x = data[:, 1:].T if name == "Nelson" else data[:, 1]
+    y = jnp.asarray(np.log(data[:, 0]) if name == "Nelson" else data[:, 0])
+    x = jnp.asarray(data[:, 1:].T if name == "Nelson" else data[:, 1])
     total = float(re.findall(r"Residual Sum of Squares: +(\S+)", text)[0])
     model = MODELS[name]
 

@@ -126,7 +126,9 @@ def test_an_effect_comes_once_except_steps_and_lines():
 
 
 def test_unknown_noise_is_named():
-    with pytest.raises(ModelError, match="unknown noise noise_pink; known are noise_white, noise_flicker, noise_random"):
+    with pytest.raises(
+        ModelError, match="unknown noise noise_pink; known are noise_white, noise_flicker, noise_random"
+    ):
         GyroModel((), {"noise_white": 1.0, "noise_pink": 1.0})
 
 

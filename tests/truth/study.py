@@ -73,15 +73,15 @@ def build(case: Case) -> Built:
     return Built(*hide(case.effect, design, noise, case.times_mde, rng), design, noise)
 
 
-def run_engine(built: Built) -> Answer:
+def run_engine(built: Built, gain: bool = False) -> Answer:
     """The only place that calls the package."""
     import gyromodel
 
     campaign = gyromodel.Campaign(columns=built.columns, units=built.units, metadata=built.metadata)
     model = gyromodel.model_from_effects(list(built.truth.baseline))
     start = time.perf_counter()
-    # Only nulls need the held-out gain: with something named it repeats the search without each block.
-    found = gyromodel.diagnose(campaign, model, hold_out=built.truth.effect is None)
+    # The held-out gain repeats the search without each block: only nulls, where nothing is found, have it always.
+    found = gyromodel.diagnose(campaign, model, hold_out=gain or built.truth.effect is None)
     seconds = time.perf_counter() - start
     driver = tuple(found.driver.column.split(" and ")) if found.driver else ()
     gain = found.gain
@@ -97,8 +97,10 @@ def run_engine(built: Built) -> Answer:
     )
 
 
-def run_case(case: Case, engine: bool = True, oracle_too: bool = True, controls: bool = False) -> Record:
-    """Simulate, diagnose and judge one case."""
+def run_case(
+    case: Case, engine: bool = True, oracle_too: bool = True, controls: bool = False, gain: bool = False
+) -> Record:
+    """Simulate, diagnose and judge one case; `gain` measures the held-out gain of an effect in white noise too."""
     built = build(case)
     truth, design = built.truth, built.design
     size, isolable, first, others = 0.0, False, "", {}
@@ -122,7 +124,7 @@ def run_case(case: Case, engine: bool = True, oracle_too: bool = True, controls:
             "stepwise_bic": contest.stepwise_bic(unit, residual),
             "lasso": contest.lasso(unit, residual),
         }
-    answer = run_engine(built) if engine else None
+    answer = run_engine(built, gain and case.noise == "white") if engine else None
     score = judge(truth, design.name, answer) if answer else None
     return Record(case, truth, answer, score, size, isolable, first, others)
 
