@@ -34,7 +34,7 @@ def allan_variance(matrix: np.ndarray, m: int) -> float:
     start = len(matrix) // 2 - m
     weights = np.zeros(len(matrix))
     weights[start : start + m], weights[start + m : start + 2 * m] = -1 / m, 1 / m
-    return 0.5 * weights @ matrix @ weights
+    return float(0.5 * weights @ matrix @ weights)
 
 
 @pytest.mark.parametrize("samples", [100, 1000, 10**4, 10**6])
