@@ -304,7 +304,7 @@ def ramp(rng: np.random.Generator) -> Campaign:
 
 UNDETERMINED = [
     (["bias", "scale_asymmetry"], {"rate": 0.0}, {"scale_asymmetry"}),
-    (["scale_factor", "bias", "bias_temperature"], {"rate": 0.0}, {"scale_factor", "bias", "bias_temperature"}),
+    (["scale_factor", "bias"], {"rate": 0.0}, {"scale_factor", "bias"}),
     (["bias", "scale_nonlinearity"], {"rate": 0.0}, {"scale_nonlinearity"}),
     (["bias", "scale_spline"], {"rate": 0.0}, {"scale_spline"}),
     (["bias", "bias_temperature"], {"temperature": 25.0}, {"bias_temperature"}),
