@@ -105,8 +105,15 @@ class Selection:
     driver: str | None
 
 
-def rank(scanner: Scanner, cells: list[int], estimate: Estimate, pulses: tuple[int, ...], skip: set[str]) -> Ranking:
-    """Rank every candidate against a fitted baseline; `pulses` are rows given up as gross errors."""
+def rank(
+    scanner: Scanner,
+    cells: list[int],
+    estimate: Estimate,
+    pulses: tuple[int, ...],
+    skip: set[str],
+    known: dict[int, CellResult] | None = None,
+) -> Ranking:
+    """Rank every candidate against a fitted baseline; `pulses` are gross errors, `known` cells done before."""
     record = scanner.record
     predicted, jacobian = estimate.model.linearise(record.signals)
     gain = float(estimate.model.gain())
@@ -123,7 +130,8 @@ def rank(scanner: Scanner, cells: list[int], estimate: Estimate, pulses: tuple[i
     }
     families = scanner.noise_families() if estimate.noise_given else {}
     wanted = sorted({*cells, *(g for f in families.values() for g in f)})
-    everything = scanner.run(wanted, columns, residual, contained)
+    everything = dict(known or {})
+    everything |= scanner.run([g for g in wanted if g not in everything], columns, residual, contained)
     results = {g: everything[g] for g in cells}
     prior = scanner.grid.log_prior
     logs = np.array([results[g].log_likelihood + prior[g] for g in cells])
@@ -152,7 +160,7 @@ def rank_where_it_matters(scanner: Scanner, estimate: Estimate, pulses: tuple[in
         return rank(scanner, scanner.all_cells(), estimate, pulses, skip)
     ranking = rank(scanner, scanner.coarse_cells(), estimate, pulses, skip)
     near = set(cells_of_weight(ranking, NEARBY))
-    return rank(scanner, scanner.neighbours(near), estimate, pulses, skip)
+    return rank(scanner, scanner.neighbours(near), estimate, pulses, skip, ranking.results)
 
 
 def cells_of_weight(ranking: Ranking, nats: float) -> list[int]:
