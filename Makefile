@@ -10,7 +10,7 @@ demo: $(READY)
 	$(BIN)/gyromodel demo
 
 test: $(READY)
-	$(BIN)/pytest -n $(TEST_WORKERS)
+	$(BIN)/pytest -n $(TEST_WORKERS) --dist worksteal
 
 lint: $(READY)
 	$(BIN)/ruff check .
