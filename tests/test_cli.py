@@ -214,7 +214,7 @@ def test_fit_recovers_the_simulated_values(bench: Path, run: Run):
 def test_fit_prints_a_table_and_its_paths(bench: Path, run: Run):
     done = run("fit", bench / "campaign.csv", "--model", bench / "simulation.yaml", "-o", bench / "out")
     assert done.status == 0, done.err
-    for part in ("scale_factor", "count/s", "±", "noise_white", "model.yaml", "fit.json"):
+    for part in ("scale_factor", "count/deg", "±", "noise_white", "model.yaml", "fit.json"):
         assert part in done.out, part
 
 
