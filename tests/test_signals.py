@@ -31,9 +31,10 @@ def test_padded_lengths_are_few_and_at_most_a_quarter_longer():
     assert (lengths >= np.arange(1, 5000)).all()
     assert (np.diff(lengths) >= 0).all()
     assert (lengths[63:] < 1.25 * np.arange(64, 5000)).all()
-    eighths = {m * 2**k for k in range(4, 13) for m in (4, 5, 6, 7)}
-    assert set(lengths[63:]) <= eighths
-    assert padded_length(10**6) == 7 * 2**17 + 2**17
+    quarters = {m * 2**k for k in range(4, 11) for m in (4, 5, 6, 7, 8)}
+    assert set(lengths[63:4096]) <= quarters
+    assert set(lengths[4096:]) <= {4096 + 256 * m for m in range(17)}
+    assert padded_length(10**6) == 31 * 2**15
 
 
 @pytest.mark.parametrize("rows", [3, 63, 64, 65, 200, 256])

@@ -10,7 +10,7 @@ import numpy as np
 
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._average import average
-from gyromodel.diagnosis._bank import Bank, build_bank
+from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores
 from gyromodel.diagnosis._gain import ladder_error, nested_gain, no_gain, not_measured
 from gyromodel.diagnosis._result import Candidate, Diagnosis, Gain, Round
@@ -44,9 +44,8 @@ FOLD_NEARBY = 3.0
 class _Session:
     """One record with its search laid out: what the main pass and every fold do alike."""
 
-    def __init__(self, record: Record, bank: Bank, grid: NoiseGrid, threshold: float, stated: bool) -> None:
-        self.record, self.bank, self.grid, self.threshold = record, bank, grid, threshold
-        self.scanner = Scanner(record, bank, grid, stated=stated)
+    def __init__(self, scanner: Scanner, threshold: float) -> None:
+        self.record, self.scanner, self.threshold = scanner.record, scanner, threshold
         self._ladder: dict[int, tuple[float, float, bool]] = {}
 
     def ladder(self, estimate: Estimate) -> tuple[float, float, bool]:
@@ -110,7 +109,7 @@ def diagnose(
     say("laying out the search", 0.06)
     bank = build_bank(record)
     grid = _grid(record, baseline)
-    session = _Session(record, bank, grid, SAFE_THRESHOLD, baseline.noise_given)
+    session = _Session(Scanner(record, bank, grid, stated=baseline.noise_given), SAFE_THRESHOLD)
     nulls = np.zeros(0)
     if calibrate:
         nulls = null_scores(session.scanner, baseline, calibrate, seed, say)
@@ -122,7 +121,7 @@ def diagnose(
         findings.append(f"The noise level follows {grows[0]}; samples are weighted accordingly.")
         record = with_variance(record, grows[1])
         baseline = fit_record(record, model)
-        session = _Session(record, bank, grid, session.threshold, baseline.noise_given)
+        session = _Session(Scanner(record, bank, grid, stated=baseline.noise_given), session.threshold)
         selection = (session.run_and_prune if hold_out else session.run)(baseline, say)
     heavy = tails(selection.estimate)
     findings += [heavy] if heavy else []
@@ -202,10 +201,8 @@ def _gain(session: _Session, baseline: Estimate, selection: Selection, unit: str
     noise = [e.ratios for e in selection.estimates]
     cells = sorted({g for ranking in rankings for g in cells_of_weight(ranking, FOLD_NEARBY)})
 
-    def select(record: Record, base: Estimate) -> Estimate:
-        fold = _Session(record, session.bank, session.grid, session.threshold, base.noise_given)
-        fold.scanner.only_cells = cells
-        return fold.run(base, noise=noise).estimate
+    def select(rows: np.ndarray, base: Estimate) -> Estimate:
+        return _Session(session.scanner.without(rows, cells), session.threshold).run(base, noise=noise).estimate
 
     return nested_gain(
         session.record,

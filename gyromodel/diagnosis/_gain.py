@@ -75,7 +75,7 @@ def ladder_error(record: Record, estimate: Estimate) -> tuple[float, float, bool
 def nested_gain(
     record: Record,
     baseline: Estimate,
-    select: Callable[[Record, Estimate], Estimate],
+    select: Callable[[np.ndarray, Estimate], Estimate],
     unit: str,
     scale: float,
     ordinary: tuple[bool, bool],
@@ -86,7 +86,7 @@ def nested_gain(
     Args:
         record: the data.
         baseline: the fitted simulation.
-        select: repeats the whole selection on a record without a block.
+        select: repeats the whole selection on the record without some rows, from the simulation fitted there.
         unit: reporting unit of the errors.
         scale: reporting units per rad/s.
         ordinary: whether the model before and the one after are used with ordinary weights.
@@ -97,7 +97,7 @@ def nested_gain(
     for k, rows in enumerate(blocks):
         try:
             base = fit_record(record.without(rows), baseline.model_as_given(), ratios=baseline.ratios)
-            extended = select(record.without(rows), base)
+            extended = select(rows, base)
             e0, s0 = _errors(record, base, rows, ordinary[0])
             e1, s1 = _errors(record, extended, rows, ordinary[1])
         except EstimateError:

@@ -7,40 +7,38 @@ frequency use cumulative sums and Fourier transforms of V⁻¹r instead of colum
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cache
-from typing import cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.fft
 from scipy.special import gammaln
 from threadpoolctl import ThreadpoolController
 
 from gyromodel.diagnosis._bank import Bank
 from gyromodel.diagnosis._evidence import log_evidence_ratio, log_mean
+from gyromodel.diagnosis._lines import PEAK_WIDTH, PEAKS, line_grid
+from gyromodel.diagnosis._points import explained_by, robust_order
 from gyromodel.estimate import make_filter, whiten_columns
-from gyromodel.model import record_span
 from gyromodel.noise import NoiseGrid, NoiseRatios
-from gyromodel.numerics.state_space import Filter, step_and_pulse_energy, whiten, whiten_transposed
+from gyromodel.numerics.state_space import Filter, at_rest, step_and_pulse_energy, whiten, whiten_on, whiten_transposed
 from gyromodel.signals import Record
 
 # A candidate whose columns keep less than this share of their energy beside the baseline cannot be tested.
 VANISHED = 1e-6
-# A line's energy is computed exactly at the lowest frequencies, at log-spaced ones to interpolate between, and at the
-# leading peaks of each pass, whose correction holds for their neighbours too.
-LOWEST_LINES, SPACED_LINES, PEAKS, PEAK_WIDTH = 24, 40, 12, 6
 COLUMN_STEP = 16
-# Fewer cycles in the record than this are a trend, not a line.
-FEWEST_CYCLES = 1.5
 THREADS = 2
+# Cells filtered side by side, and rows whitened at a time: they stay in cache.
+CELLS_TOGETHER, ROWS_TOGETHER = 8, 1024
 # Records this short are test points, each of which may be anomalous; longer ones are series with single gross errors.
 TEST_POINTS = 40
 
 _energies = jax.jit(step_and_pulse_energy)
+_whiten_rows = jax.jit(whiten_on)
 
 
 @cache
@@ -53,40 +51,7 @@ def _precision(filter: Filter, columns):
     return whiten_transposed(filter, whiten(filter, columns))
 
 
-@dataclass
-class LineGrid:
-    """Frequencies searched for lines (Hz) and the Fourier grid that serves them, from its bin number `first` on."""
-
-    frequencies: np.ndarray
-    index: np.ndarray
-    length: int
-    first: int
-    exact: np.ndarray
-    basis: np.ndarray = field(repr=False)
-
-
-def line_grid(record: Record) -> LineGrid:
-    """A quarter of the record's resolution, up to half the sample rate."""
-    time = np.asarray(record.signals["time"])
-    span = record_span(record)
-    grid = record.interval
-    if np.abs(time[: record.rows] / grid - np.round(time[: record.rows] / grid)).max() > 0.1:
-        grid /= 4.0
-    grid = max(grid, span / 2**18)
-    # scipy declares no return type here.
-    length = cast(int, scipy.fft.next_fast_len(int(np.ceil(4.0 * (span + grid) / grid)), real=True))
-    first = int(np.ceil(FEWEST_CYCLES / span * length * grid))
-    frequencies = np.arange(first, length // 2 + 1) / (length * grid)
-    frequencies = frequencies[frequencies < 0.5 / record.interval * (1 - 0.5 / record.rows)]
-    exact = np.arange(min(LOWEST_LINES, len(frequencies)))
-    spaced = np.geomspace(len(exact) + 1, len(frequencies), SPACED_LINES).round().astype(int) - 1
-    exact = np.unique(np.concatenate([exact, np.clip(spaced, 0, len(frequencies) - 1)]))
-    phase = 2.0 * np.pi * time[:, None] * frequencies[exact]
-    index = np.minimum(np.round(time / grid).astype(int), length - 1)
-    return LineGrid(frequencies, index, length, first, exact, np.concatenate([np.cos(phase), np.sin(phase)], axis=1))
-
-
-@dataclass
+@dataclass(frozen=True)
 class Cell:
     """What one noise cell remembers between rounds."""
 
@@ -96,6 +61,9 @@ class Cell:
     step: np.ndarray
     pulse: np.ndarray
     line: np.ndarray
+
+
+NO_LINES = np.zeros((0, 2, 2))
 
 
 @dataclass
@@ -146,9 +114,10 @@ class Scanner:
         self.only_cells = self.all_cells()[: 1 if stated else None] if stated or len(grid.log_prior) == 1 else None
         self.by_points = int(self.present.sum()) <= TEST_POINTS
         self.cells: dict[int, Cell] = {}
-        extra = self.lines.basis if self.lines else np.zeros((len(self.present), 0))
-        raw = np.concatenate([bank.columns, extra], axis=1)
-        self._raw = jnp.asarray(np.pad(raw, ((0, 0), (0, -raw.shape[1] % COLUMN_STEP))))
+        waves = self.lines.waves(self.lines.exact) if self.lines else np.zeros((len(self.present), 0))
+        raw = np.concatenate([bank.columns, waves], axis=1)
+        raw = np.pad(raw, ((0, 0), (0, -raw.shape[1] % COLUMN_STEP)))
+        self._raw = [jnp.asarray(raw[i : i + ROWS_TOGETHER]) for i in range(0, len(raw), ROWS_TOGETHER)]
         widths = [b.width for b in bank.blocks]
         self._layout = {
             q: (widths.index(q), widths.count(q), bank.blocks[widths.index(q)].start) for q in sorted(set(widths))
@@ -162,6 +131,15 @@ class Scanner:
         self._widths = np.array([b.width for b in bank.blocks], int)
         self._positive = np.array([b.effect is not None and b.effect.positive for b in bank.blocks])
         self.epochs = np.flatnonzero(self.present[: record.rows])[1:-1]
+
+    def without(self, rows: np.ndarray, cells: list[int]) -> Scanner:
+        """The same search on the record without some rows, in some of the noise cells."""
+        other = copy(self)
+        other.record = self.record.without(rows)
+        other.present = np.asarray(other.record.sampling.present)
+        other.epochs = np.flatnonzero(other.present[: other.record.rows])[1:-1]
+        other.cells, other.only_cells = {}, cells
+        return other
 
     def all_cells(self) -> list[int]:
         """Every noise cell."""
@@ -194,27 +172,53 @@ class Scanner:
             if any(abs(flicker[g] - flicker[c]) <= 1 and abs(walk[g] - walk[c]) <= 1 for c in cells)
         ]
 
-    def _prepare(self, g: int) -> Cell:
-        ratios = NoiseRatios(self.grid.ratios.flicker[g], self.grid.ratios.walk[g])
-        filter = make_filter(ratios, self.grid.interval, self.grid.span, self.record.sampling)
-        w = np.asarray(whiten_columns(filter, self._raw))
-        blocks = {}
-        for q, (_, count, start) in self._layout.items():
-            part = w[:, start : start + q * count]
-            gram = (part.T @ part).reshape(count, q, count, q)
-            blocks[q] = np.ascontiguousarray(np.einsum("bicj->bcij", gram)[np.arange(count), np.arange(count)])
-        line = np.zeros((0, 2, 2))
-        if self.lines:
-            lw = w[:, self.bank.columns.shape[1] :][:, : self.lines.basis.shape[1]]
-            line = _line_energy(lw, self.lines)
-        step, pulse = (np.asarray(e) for e in _energies(filter))
-        return Cell(filter, float(filter.log_determinant), blocks, step, pulse, line)
-
     def cell(self, g: int) -> Cell:
         """The cell's memory, made at first use."""
         if g not in self.cells:
-            self.cells[g] = self._prepare(g)
+            self._prepare([g], map)
         return self.cells[g]
+
+    def _prepare(self, cells: Sequence[int], each: Callable[..., Iterable]) -> None:
+        """Make the memory of these cells; `each` is `map` or a pool's."""
+        groups = [cells[i : i + CELLS_TOGETHER] for i in range(0, len(cells), CELLS_TOGETHER)]
+        made = [cell for group in each(self._filters, groups) for cell in group]
+        for g, cell in zip(cells, each(self._with_energies, made), strict=True):
+            self.cells[g] = cell
+
+    def _filters(self, cells: Sequence[int]) -> list[Cell]:
+        """Cells without their candidates' energies."""
+        index = np.resize(cells, CELLS_TOGETHER)
+        ratios = NoiseRatios(*(np.asarray(r)[index] for r in self.grid.ratios))
+        filter = make_filter(ratios, self.grid.interval, self.grid.span, self.record.sampling)
+        step, pulse = (np.asarray(e) for e in _energies(filter))
+        gain, scale = np.asarray(filter.gain), np.asarray(filter.scale)
+        log_determinant = np.asarray(filter.log_determinant)
+        made = []
+        for i in range(len(cells)):
+            own = filter._replace(gain=jnp.asarray(gain[..., i]), scale=jnp.asarray(scale[..., i]))
+            made.append(Cell(own, float(log_determinant[i]), {}, step[:, i].copy(), pulse[:, i].copy(), NO_LINES))
+        return made
+
+    def _with_energies(self, cell: Cell) -> Cell:
+        """CᵀV⁻¹C of every block and line, a few rows at a time."""
+        filter = Filter(*(np.asarray(part) for part in cell.filter))
+        state = at_rest(cell.filter, self._raw[0].shape[1])
+        blocks: dict[int, np.ndarray] = dict.fromkeys(self._layout, np.zeros(()))
+        first, lines = self.bank.columns.shape[1], len(self.lines.exact) if self.lines else 0
+        waves = np.zeros((3, lines))
+        for i, raw in enumerate(self._raw):
+            here = slice(i * ROWS_TOGETHER, (i + 1) * ROWS_TOGETHER)
+            state, rows = _whiten_rows(state, Filter(*(part[here] for part in filter)), raw)
+            w = np.asarray(rows)
+            for q, (_, count, start) in self._layout.items():
+                part = w[:, start : start + q * count]
+                blocks[q] = blocks[q] + part.T @ part
+            c, s = w[:, first : first + lines], w[:, first + lines : first + 2 * lines]
+            waves += np.stack([np.sum(x * y, axis=0) for x, y in ((c, c), (s, s), (c, s))])
+        for q, (_, count, _) in self._layout.items():
+            square = blocks[q].reshape(count, q, count, q)
+            blocks[q] = square[np.arange(count), :, np.arange(count), :]
+        return replace(cell, blocks=blocks, line=self.lines.energies(*waves) if self.lines else NO_LINES)
 
     def whiten(self, g: int, columns: jax.Array) -> np.ndarray:
         """Columns whitened in one noise cell."""
@@ -247,6 +251,7 @@ class Scanner:
         data = jnp.asarray(np.pad(np.where(self.present[:, None], stacked, 0.0), ((0, 0), (0, pad))))
         # Cells share the cores; BLAS threads on top of them would only wait for one another.
         with _libraries().limit(limits=1, user_api="blas"), ThreadPoolExecutor(THREADS) as pool:
+            self._prepare([g for g in cells if g not in self.cells], pool.map)
             return list(pool.map(lambda g: self._run_cell(g, data, jacobian.shape[1], stacked.shape[1], least), cells))
 
     @property
@@ -333,8 +338,8 @@ class Scanner:
         price = gammaln(len(rows) + 1) - gammaln(sizes + 1) - gammaln(len(rows) - sizes + 1) + np.log(len(sizes))
         evidence, sets, explained, dimension = [], [], [], []
         for y, rss in zip(zy.T, batch.rss, strict=True):
-            order = _robust_order(left, y)
-            t = np.array([_explained(left, y, order[:m]) for m in sizes])
+            order = robust_order(left, y)
+            t = np.array([explained_by(left, y, order[:m]) for m in sizes])
             ratio = log_evidence_ratio(np.minimum(t, rss), rss, nu, sizes) - price
             top = int(np.argmax(ratio))
             evidence.append(float(np.logaddexp.reduce(ratio)))
@@ -347,12 +352,8 @@ class Scanner:
 
     def _lines(self, batch: Batch, cell: Cell, zj: np.ndarray, zy: np.ndarray, nu: int) -> None:
         assert self.lines is not None
-        grid, p = self.lines, zj.shape[1]
-        count = len(grid.frequencies)
-        spread = np.zeros((grid.length, p + zy.shape[1]))
-        np.add.at(spread, grid.index, np.column_stack([zj, zy]))
-        spectrum = np.asarray(scipy.fft.rfft(spread, axis=0))[grid.first : grid.first + count]
-        c, s = np.real(spectrum), -np.imag(spectrum)
+        p = zj.shape[1]
+        c, s = self.lines.spectrum(np.column_stack([zj, zy]))
         a11 = cell.line[:, 0, 0] - np.sum(c[:, :p] ** 2, axis=1)
         a22 = cell.line[:, 1, 1] - np.sum(s[:, :p] ** 2, axis=1)
         a12 = cell.line[:, 0, 1] - np.sum(c[:, :p] * s[:, :p], axis=1)
@@ -363,18 +364,17 @@ class Scanner:
         t = weight * (a22[:, None] * bc**2 - 2 * a12[:, None] * bc * bs + a11[:, None] * bs**2)
         if t.shape[1] == 1:
             self._exact_peaks(cell, t[:, 0], c, s)
-        self._record(batch, "bias_periodic", np.arange(count), t, np.where(keep, a11, 0.0), 2, nu)
+        self._record(batch, "bias_periodic", np.arange(len(t)), t, np.where(keep, a11, 0.0), 2, nu)
 
     def _exact_peaks(self, cell: Cell, t: np.ndarray, c: np.ndarray, s: np.ndarray) -> None:
         """Correct the statistic around the leading peaks, in place, by their exact energy."""
         assert self.lines is not None
         local = np.flatnonzero((t[1:-1] >= t[:-2]) & (t[1:-1] >= t[2:])) + 1
         peaks = local[np.argsort(-t[local])][:PEAKS]
-        phase = 2.0 * np.pi * np.asarray(self.record.signals["time"])[:, None] * self.lines.frequencies[peaks]
-        basis = np.pad(np.concatenate([np.cos(phase), np.sin(phase)], axis=1), ((0, 0), (0, 2 * (PEAKS - len(peaks)))))
-        w = np.asarray(whiten_columns(cell.filter, jnp.asarray(basis)))
+        waves = self.lines.waves(np.resize(peaks, PEAKS)) if len(peaks) else np.zeros((len(self.present), 0))
+        w = np.asarray(whiten_columns(cell.filter, jnp.asarray(waves)))
         for i, k in enumerate(peaks):
-            pair = w[:, [i, len(peaks) + i]]
+            pair = w[:, [i, PEAKS + i]]
             cross = np.stack([c[k], s[k]])
             a = pair.T @ pair - cross[:, :-1] @ cross[:, :-1].T
             sound = np.linalg.det(a) > 1e-3 * np.prod(np.sum(pair**2, axis=0))
@@ -393,38 +393,3 @@ class Scanner:
         batch.evidence[name] = log_mean(ratio)
         batch.best[name] = (list(where[top]), t[top, np.arange(t.shape[1])], np.full(t.shape[1], float(q)))
         batch.energy[name] = energy
-
-
-def _explained(left: np.ndarray, y: np.ndarray, chosen: np.ndarray) -> float:
-    return float(y[chosen] @ np.linalg.lstsq(left[np.ix_(chosen, chosen)], y[chosen], rcond=1e-10)[0])
-
-
-def _robust_order(left: np.ndarray, zy: np.ndarray) -> np.ndarray:
-    """Rows by how anomalous they are, from a backward search: drop the worst, refit, repeat."""
-    rows, dropped = list(range(len(zy))), []
-    best: tuple[float, list[int]] = (np.inf, [])
-    # Start from every pair of points held good, keep the start whose median misfit is least: masking cannot hide there.
-    covariance, y = left, zy
-    for i in range(len(rows)):
-        for j in range(i):
-            out = [k for k in rows if k not in (i, j)]
-            shift = np.linalg.lstsq(covariance[np.ix_(out, out)], y[out], rcond=1e-10)[0]
-            misfit = np.sort(np.abs(shift))[len(out) // 2]
-            if misfit < best[0]:
-                best = (float(misfit), [out[k] for k in np.argsort(-np.abs(shift))])
-    return np.array(best[1] + dropped)
-
-
-def _line_energy(whitened: np.ndarray, grid: LineGrid) -> np.ndarray:
-    """2×2 energies of cosine and sine at every frequency: exact at some, the mean power interpolated between."""
-    count = len(grid.exact)
-    c, s = whitened[:, :count], whitened[:, count:]
-    cc, ss, cs = (c**2).sum(0), (s**2).sum(0), (c * s).sum(0)
-    mean = np.interp(np.log(grid.frequencies), np.log(grid.frequencies[grid.exact]), 0.5 * (cc + ss))
-    out = np.zeros((len(grid.frequencies), 2, 2))
-    out[:, 0, 0] = out[:, 1, 1] = mean
-    low = grid.exact < LOWEST_LINES
-    i = grid.exact[low]
-    out[i, 0, 0], out[i, 1, 1] = cc[low], ss[low]
-    out[i, 0, 1] = out[i, 1, 0] = cs[low]
-    return out

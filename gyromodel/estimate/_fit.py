@@ -13,7 +13,7 @@ from gyromodel.campaign import Campaign
 from gyromodel.estimate._estimate import Estimate, EstimateError, noise_coefficients
 from gyromodel.estimate._optimistix import optimistix_solution
 from gyromodel.model import GyroModel, ModelError, check_units, record_span
-from gyromodel.noise import NoiseRatios, markov_sum, noise_grid, restricted_likelihood
+from gyromodel.noise import NoiseRatios, from_grams, markov_sum, noise_grid, restricted_likelihood
 from gyromodel.numerics.least_squares import Normal, Solution, levenberg_marquardt
 from gyromodel.numerics.state_space import Filter, build_filter, colour, whiten, whitened_gram
 from gyromodel.signals import Record, read_signals
@@ -87,25 +87,20 @@ def fit_record(
             f"{int(record.present.sum())} samples cannot determine {len(model.slots())} parameters and their noise"
         )
     given = given_ratios(record, model) if ratios is None else ratios
-    now = given if given is not None else NoiseRatios(jnp.zeros(()), jnp.zeros(()))
-    x, solution = np.asarray(model.vector()), None
-    for turn in range(1 if given is not None else 4):
-        solution = solve(model, x, record, now, solver)
-        x = solution.x
-        if given is not None:
+    white = NoiseRatios(jnp.zeros(()), jnp.zeros(()))
+    ratios = given if given is not None else white
+    filter = filter_of(record, ratios)
+    solution = solve(model, np.asarray(model.vector()), record, filter, solver)
+    for turn in range(0 if given is not None else 4):
+        before = ratios
+        ratios = best_ratios(record, model.with_vector(jnp.asarray(solution.x)), coarse=turn == 0, start=before)
+        filter = filter_of(record, ratios)
+        solution = solve(model, solution.x, record, filter, solver)
+        if turn and _close(before, ratios):
             break
-        fitted = model.with_vector(jnp.asarray(x))
-        before = now
-        now = best_ratios(record, fitted, coarse=turn == 0, start=now)
-        if turn and _close(before, now):
-            break
-    assert solution is not None
-    if given is None:
-        solution = solve(model, x, record, now, solver)
     if ordinary:
-        white = NoiseRatios(jnp.zeros(()), jnp.zeros(()))
-        solution = solve(model, solution.x, record, white, solver)
-    return _finish(record, model.with_vector(jnp.asarray(solution.x)), now, solution, intervals, ordinary)
+        solution = solve(model, solution.x, record, filter_of(record, white), solver)
+    return _finish(record, model.with_vector(jnp.asarray(solution.x)), ratios, filter, solution, intervals, ordinary)
 
 
 def check_covariates(record: Record, model: GyroModel) -> None:
@@ -150,9 +145,8 @@ whiten_columns = jax.jit(whiten)
 _gram = jax.jit(whitened_gram)
 
 
-def solve(model: GyroModel, x: np.ndarray, record: Record, ratios: NoiseRatios, solver: Solver) -> Solution:
+def solve(model: GyroModel, x: np.ndarray, record: Record, filter: Filter, solver: Solver) -> Solution:
     """Minimise the whitened sum of squares; optimistix takes over where the own solver does not converge."""
-    filter = filter_of(record, ratios)
     output = record.signals["output"]
 
     def normal(v: np.ndarray) -> Normal:
@@ -189,12 +183,21 @@ def best_ratios(record: Record, model: GyroModel, *, coarse: bool, start: NoiseR
     best = start
     if coarse:
         grid = noise_grid(int(record.present.sum()), record.interval, span)
-        best = _at(grid.ratios, int(np.argmax(likelihood(grid.ratios))))
-    for width in (2.2, 1.3, 0.7, 0.4, 0.2) if coarse else (0.7, 0.35, 0.17):
-        factors = np.exp(width * np.linspace(-1, 1, 5))
-        cells = _mesh(np.unique(np.asarray(r) * factors) for r in best)
+        # Every other level, then the levels around the best of them.
+        levels = [np.unique(r) for r in grid.ratios]
+        first = _mesh(level[::2] for level in levels)
+        best = _at(first, int(np.argmax(likelihood(first))))
+        near = _mesh(_around(level, float(r)) for level, r in zip(levels, best, strict=True))
+        best = _at(near, int(np.argmax(likelihood(near))))
+    for width in (0.8, 0.4, 0.2, 0.1) if coarse else (0.7, 0.35, 0.17):
+        cells = _mesh(np.unique(np.asarray(r) * np.exp(width * np.array([-1.0, 0.0, 1.0]))) for r in best)
         best = _at(cells, int(np.argmax(likelihood(cells))))
     return best
+
+
+def _around(levels: np.ndarray, level: float) -> np.ndarray:
+    i = int(np.searchsorted(levels, level))
+    return levels[max(i - 1, 0) : i + 2]
 
 
 def _mesh(levels: Iterable[np.ndarray]) -> NoiseRatios:
@@ -211,24 +214,28 @@ def _close(a: NoiseRatios, b: NoiseRatios) -> bool:
 
 
 def _finish(
-    record: Record, model: GyroModel, ratios: NoiseRatios, solution: Solution, intervals: bool, ordinary: bool
+    record: Record,
+    model: GyroModel,
+    ratios: NoiseRatios,
+    filter: Filter,
+    solution: Solution,
+    intervals: bool,
+    ordinary: bool,
 ) -> Estimate:
     predicted, jacobian = model.linearise(record.signals)
     output, present = record.signals["output"], record.sampling.present
     residual = jnp.where(present, output - predicted, 0.0)
-    filter = filter_of(record, ratios)
     p = jacobian.shape[1]
     w = np.asarray(whiten_columns(filter, pad_columns(jnp.column_stack([jacobian, residual]))))[
         np.asarray(present), : p + 1
     ]
     covariance = unit_covariance(w[:, :p], model)
     if ordinary:
-        covariance = _ordinary_covariance(record, ratios, jacobian, model)
+        covariance = _ordinary_covariance(record, filter, jacobian, model)
     nu = len(w) - p
     variance = float(w[:, p] @ w[:, p]) / nu
+    likelihood = from_grams(np.atleast_1d(filter.log_determinant), (w.T @ w)[None], len(w)).log_likelihood[0]
     args = (record.interval, record_span(record), record.sampling, jacobian, residual)
-    one = NoiseRatios(jnp.atleast_1d(ratios.flicker), jnp.atleast_1d(ratios.walk))
-    likelihood = restricted_likelihood(one, *args)
     gain = float(model.gain())
     noise = dict(model.noise) or noise_coefficients(ratios, variance, record, gain)
     spans = _noise_intervals(args, ratios, record, gain) if intervals and not model.noise else {}
@@ -243,7 +250,7 @@ def _finish(
         whitened=whitened,
         ratios=ratios,
         white_variance=variance,
-        log_likelihood=float(likelihood.log_likelihood[0]),
+        log_likelihood=float(likelihood),
         converged=bool(solution.converged),
         iterations=int(solution.iterations),
         record=record,
@@ -281,12 +288,12 @@ def unit_covariance(whitened_jacobian: np.ndarray, model: GyroModel) -> np.ndarr
     return (inverse @ inverse.T) / np.outer(norm, norm)
 
 
-def _ordinary_covariance(record: Record, ratios: NoiseRatios, jacobian, model: GyroModel) -> np.ndarray:
+def _ordinary_covariance(record: Record, filter: Filter, jacobian, model: GyroModel) -> np.ndarray:
     """(JᵀWJ)⁻¹ JᵀWVWJ (JᵀWJ)⁻¹ for weights W = 1/white, in units of the white variance."""
     weighted = jnp.where(record.sampling.present[:, None], jacobian / record.sampling.white[:, None], 0.0)
     root = jnp.where(record.sampling.present[:, None], jacobian / jnp.sqrt(record.sampling.white)[:, None], 0.0)
     bread = unit_covariance(np.asarray(root), model)
-    meat = np.asarray(_coloured_transposed(filter_of(record, ratios), weighted))
+    meat = np.asarray(_coloured_transposed(filter, weighted))
     return bread @ (meat.T @ meat) @ bread
 
 

@@ -1,6 +1,6 @@
 """Noise as part of the model: white, flicker and random walk as state-space blocks, and their restricted likelihood."""
 
-from gyromodel.noise._likelihood import CellFit, restricted_likelihood
+from gyromodel.noise._likelihood import CellFit, from_grams, restricted_likelihood
 from gyromodel.noise._model import NOISE_UNITS, NoiseGrid, NoiseRatios, coefficients, markov_sum, noise_grid
 
 __all__ = [
@@ -9,6 +9,7 @@ __all__ = [
     "NoiseGrid",
     "NoiseRatios",
     "coefficients",
+    "from_grams",
     "markov_sum",
     "noise_grid",
     "restricted_likelihood",

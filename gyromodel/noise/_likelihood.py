@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
@@ -10,11 +11,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from gyromodel.noise._model import NoiseRatios, markov_sum
-from gyromodel.numerics.state_space import Sampling, build_filter, whiten
+from gyromodel.numerics.state_space import Sampling, log_determinant_and_gram
 
-# Cells whitened together: enough to fill vector units, few enough for memory, and fewer for records of many samples.
-CELLS_TOGETHER, FEW_CELLS = 32, 4
-MANY_SAMPLES = 50_000
+# Cells filtered together: whole vector units, and few sizes to compile for.
+CELLS_TOGETHER, FEW_CELLS = 32, 8
+THREADS = 2
 COLUMN_STEP = 8
 
 
@@ -28,12 +29,8 @@ class CellFit(NamedTuple):
 
 @jax.jit
 def _grams(ratios: NoiseRatios, interval, span, sampling: Sampling, columns):
-    def one(flicker, walk):
-        filter = build_filter(markov_sum(NoiseRatios(flicker, walk), interval, span), sampling)
-        w = whiten(filter, columns)
-        return filter.log_determinant, w.T @ w
-
-    return jax.vmap(one)(*ratios)
+    logs, grams = log_determinant_and_gram(markov_sum(ratios, interval, span), sampling, columns)
+    return logs, jnp.moveaxis(grams, -1, 0)
 
 
 def gram_by_cell(
@@ -42,18 +39,22 @@ def gram_by_cell(
     """ln |V| and Xᵀ V⁻¹ X of every cell, cells in groups of a fixed size and columns padded, so that shapes recur."""
     width = -(-columns.shape[1] // COLUMN_STEP) * COLUMN_STEP
     padded = jnp.pad(columns, ((0, 0), (0, width - columns.shape[1])))
-    count = ratios.flicker.shape[0]
-    together = CELLS_TOGETHER if count > FEW_CELLS and len(columns) <= MANY_SAMPLES else FEW_CELLS
-    groups = -(-count // together)
-    # In NumPy: JAX would compile the padding and slicing for every number of cells.
-    fill = NoiseRatios(*(np.pad(np.asarray(x), (0, groups * together - count), mode="edge") for x in ratios))
-    logs, grams = [], []
-    for i in range(groups):
-        part = NoiseRatios(*(x[i * together : (i + 1) * together] for x in fill))
+    # In NumPy: JAX would compile the slicing for every number of cells.
+    flicker, walk = (np.asarray(r) for r in ratios)
+    parts, start = [], 0
+    while start < len(flicker):
+        size = CELLS_TOGETHER if len(flicker) - start > 2 * FEW_CELLS else FEW_CELLS
+        index = np.minimum(np.arange(start, start + size), len(flicker) - 1)
+        parts.append(NoiseRatios(flicker[index], walk[index]))
+        start += size
+
+    def work(part: NoiseRatios) -> tuple[np.ndarray, np.ndarray]:
         log, gram = _grams(part, interval, span, sampling, padded)
-        logs.append(np.asarray(log))
-        grams.append(np.asarray(gram)[:, : columns.shape[1], : columns.shape[1]])
-    return np.concatenate(logs)[:count], np.concatenate(grams)[:count]
+        return np.asarray(log), np.asarray(gram)[:, : columns.shape[1], : columns.shape[1]]
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        logs, grams = zip(*pool.map(work, parts), strict=True)
+    return np.concatenate(logs)[: len(flicker)], np.concatenate(grams)[: len(flicker)]
 
 
 def restricted_likelihood(
@@ -65,13 +66,18 @@ def restricted_likelihood(
     residual: Float[Array, " sample"],
 ) -> CellFit:
     """−½ ln|V| − ½ ln|JᵀV⁻¹J| − (ν/2) ln RSS of every cell."""
-    log_det, gram = gram_by_cell(ratios, interval, span, sampling, jnp.column_stack([jacobian, residual]))
-    p = jacobian.shape[1]
-    nu = int(np.asarray(sampling.present).sum()) - p
+    log_determinant, gram = gram_by_cell(ratios, interval, span, sampling, jnp.column_stack([jacobian, residual]))
+    return from_grams(log_determinant, gram, int(np.asarray(sampling.present).sum()))
+
+
+def from_grams(log_determinant: np.ndarray, gram: np.ndarray, samples: int) -> CellFit:
+    """The restricted likelihood from ln |V| and XᵀV⁻¹X of each cell, X the Jacobian with the residual last."""
+    p = gram.shape[1] - 1
+    nu = samples - p
     a, b, c = gram[:, :p, :p], gram[:, :p, p], gram[:, p, p]
     norm = np.sqrt(np.maximum(np.einsum("gii->gi", a), 1e-300))
     scaled = a / (norm[:, :, None] * norm[:, None, :]) + 1e-13 * np.eye(p)
     rss = c - np.einsum("gi,gi->g", b / norm, np.linalg.solve(scaled, (b / norm)[..., None])[..., 0]) if p else c
     log_j = np.linalg.slogdet(scaled)[1] + 2 * np.log(norm).sum(1) if p else 0.0
     rss = np.maximum(rss, 1e-300)
-    return CellFit(-0.5 * log_det - 0.5 * log_j - 0.5 * nu * np.log(rss), rss, nu)
+    return CellFit(-0.5 * log_determinant - 0.5 * log_j - 0.5 * nu * np.log(rss), rss, nu)

@@ -41,7 +41,7 @@ class NoiseGrid(NamedTuple):
 
 
 def markov_sum(ratios: NoiseRatios, interval: float | Array, span: float | Array) -> MarkovSum:
-    """One noise cell as a sum of Markov processes: the random walk first, then flicker.
+    """Noise cells as a sum of Markov processes: the random walk first, then flicker.
 
     Markov terms of equal variance B² ln(ρ)/π whose time constants stand at ratio ρ add up to B²/(2πf).
     """
@@ -50,8 +50,7 @@ def markov_sum(ratios: NoiseRatios, interval: float | Array, span: float | Array
     spacing = jnp.log(span / interval) / (FLICKER_STATES - 1)
     each = ratios.flicker * spacing / jnp.pi
     decay = jnp.concatenate([jnp.zeros(1), 1.0 / constants])
-    variance = jnp.concatenate([jnp.atleast_1d(ratios.walk / interval), jnp.full(FLICKER_STATES, 1.0) * each])
-    return MarkovSum(decay, variance)
+    return MarkovSum(decay, jnp.stack([ratios.walk / interval, *[each] * FLICKER_STATES]))
 
 
 def noise_grid(samples: int, interval: float, span: float) -> NoiseGrid:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 # Rows whitened at a time for a Gram matrix: they stay in cache, and the products are large enough to be fast.
@@ -33,77 +34,137 @@ class Sampling(NamedTuple):
 
 
 class MarkovSum(NamedTuple):
-    """Sum of Markov processes: decay rates (1/s); stationary variances, for a decay of zero variance per second."""
+    """Sum of Markov processes: decay rates (1/s); stationary variances, for a decay of zero variance per second.
+
+    Further axes of the variances are cells: noises of the same decays, filtered side by side.
+    """
 
     decay: Float[Array, " state"]
-    variance: Float[Array, " state"]
+    variance: Float[Array, "state ..."]
 
 
 class Filter(NamedTuple):
     """What the whitening recursions need: transition and gain per sample, and the innovation's standard deviation."""
 
-    transition: Float[Array, "sample state"]
-    gain: Float[Array, "sample state"]
-    scale: Float[Array, " sample"]
-    present: Bool[Array, " sample"]
+    transition: Float[Array | np.ndarray, "sample state"]
+    gain: Float[Array | np.ndarray, "sample state *cell"]
+    scale: Float[Array | np.ndarray, "sample ..."]
+    present: Bool[Array | np.ndarray, " sample"]
 
     @property
-    def log_determinant(self) -> Float[Array, ""]:
+    def log_determinant(self) -> Float[Array, "*cell"]:
         """ln |V| of the samples present."""
-        return 2.0 * jnp.sum(jnp.where(self.present, jnp.log(self.scale), 0.0))
+        present = _over_cells(self.present, self.scale.ndim - 1)
+        return 2.0 * jnp.sum(jnp.where(present, jnp.log(self.scale), 0.0), axis=0)
+
+
+def _over_cells(x, cells: int):
+    """The array with as many axes of length one at the end; cells come last so that the processor runs along them."""
+    return x.reshape(*x.shape, *(1,) * cells)
 
 
 def build_filter(noise: MarkovSum, sampling: Sampling) -> Filter:
     """Run the covariance recursion once; the result whitens any number of columns."""
-    decaying = noise.decay > 0
-    prior = jnp.diag(jnp.where(decaying, noise.variance, 0.0))
+    return _filter_on(_prior(noise), noise, sampling)[1]
+
+
+def _prior(noise: MarkovSum):
+    """Covariance of the states before the first sample of a record."""
+    cells = noise.variance.ndim - 1
+    stationary = jnp.where(_over_cells(noise.decay > 0, cells), noise.variance, 0.0)
+    return _over_cells(jnp.eye(len(noise.decay)), cells) * stationary
+
+
+def _filter_on(covariance, noise: MarkovSum, sampling: Sampling):
+    """The covariance after some samples that follow on `covariance`, and their filter."""
+    cells = noise.variance.ndim - 1
+    prior, identity = _prior(noise), _over_cells(jnp.eye(len(noise.decay)), cells)
 
     def step(covariance, inputs):
         interval, restart, present, white = inputs
         # Transition into this sample from the previous one.
         phi = jnp.exp(-noise.decay * interval)
-        added = noise.variance * jnp.where(decaying, -jnp.expm1(-2.0 * noise.decay * interval), interval)
-        covariance = jnp.where(restart, prior, jnp.outer(phi, phi) * covariance + jnp.diag(added))
+        added = noise.variance * _over_cells(jnp.where(noise.decay > 0, 1.0 - phi**2, interval), cells)
+        moved = _over_cells(jnp.outer(phi, phi), cells) * covariance + identity * added
+        covariance = jnp.where(restart, prior, moved)
         cross = covariance.sum(1)
-        variance = cross.sum() + white
+        variance = cross.sum(0) + white
         gain = jnp.where(present, cross / variance, 0.0)
-        covariance = covariance - jnp.outer(gain, cross)
+        covariance = covariance - gain[:, None] * cross
         return covariance, (jnp.where(restart, 0.0, phi), gain, jnp.sqrt(variance))
 
-    _, (transition, gain, scale) = jax.lax.scan(step, prior, sampling)
-    return Filter(transition, gain, scale, sampling.present)
+    covariance, (transition, gain, scale) = jax.lax.scan(step, covariance, sampling)
+    return covariance, Filter(transition, gain, scale, sampling.present)
 
 
-def whiten(filter: Filter, columns: Float[Array, "sample column"]) -> Float[Array, "sample column"]:
+def whiten(filter: Filter, columns: Float[Array, "sample column"]) -> Float[Array, "sample column *cell"]:
     """L⁻¹ applied to columns; rows of missing samples come out zero."""
-    return _whiten_on(jnp.zeros((filter.gain.shape[1], columns.shape[1])), filter, columns)[1]
+    return whiten_on(at_rest(filter, columns.shape[1]), filter, columns)[1]
+
+
+def at_rest(filter: Filter, columns: int) -> Float[Array, "state column *cell"]:
+    """The state of the whitening recursion before the first sample."""
+    return jnp.zeros((filter.gain.shape[1], columns, *filter.gain.shape[2:]))
 
 
 def whitened_gram(filter: Filter, columns: Float[Array, "sample column"]) -> Float[Array, "column column"]:
     """XᵀV⁻¹X of columns X; on long records a few rows at a time, so that the whitened columns are never stored."""
-    rows, width = columns.shape
-    if rows < SHORT:
-        w = whiten(filter, columns)
-        return w.T @ w
+    width = columns.shape[1]
 
-    def add(start, length, state, gram):
-        here, part = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, length), (filter, columns))
-        state, w = _whiten_on(state, here, part)
+    def add(rows, carry):
+        state, gram = carry
+        state, w = whiten_on(state, *rows)
         return state, gram + w.T @ w
 
-    last = rows % GRAM_ROWS
-    carry = jnp.zeros((filter.gain.shape[1], width)), jnp.zeros((width, width))
-    carry = jax.lax.fori_loop(0, rows // GRAM_ROWS, lambda i, c: add(i * GRAM_ROWS, GRAM_ROWS, *c), carry)
-    return add(rows - last, last, *carry)[1] if last else carry[1]
+    return _in_parts(add, (filter, columns), (at_rest(filter, width), jnp.zeros((width, width))))[1]
 
 
-def _whiten_on(state, filter: Filter, columns):
-    """Whitened rows that follow on `state`, and the state after them."""
+def log_determinant_and_gram(
+    noise: MarkovSum, sampling: Sampling, columns: Float[Array, "sample column"]
+) -> tuple[Float[Array, "*cell"], Float[Array, "column column *cell"]]:
+    """ln |V| and XᵀV⁻¹X of columns X; on long records a few rows at a time, so that not even the filter is stored."""
+    width, cells = columns.shape[1], noise.variance.shape[1:]
+
+    def add(rows, carry):
+        covariance, state, log_determinant, gram = carry
+        covariance, filter = _filter_on(covariance, noise, rows[0])
+        state, w = whiten_on(state, filter, rows[1])
+        return (
+            covariance,
+            state,
+            log_determinant + filter.log_determinant,
+            gram + jnp.einsum("ni...,nj...->ij...", w, w),
+        )
+
+    state = jnp.zeros((len(noise.decay), width, *cells))
+    start = _prior(noise), state, jnp.zeros(cells), jnp.zeros((width, width, *cells))
+    return _in_parts(add, (sampling, columns), start)[2:]
+
+
+def _in_parts(add, rows, carry):
+    """`add(part, carry)` over arrays of rows, GRAM_ROWS at a time where they are many."""
+    count = jax.tree.leaves(rows)[0].shape[0]
+    if count < SHORT:
+        return add(rows, carry)
+
+    def part(start, length):
+        return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, length), rows)
+
+    last = count % GRAM_ROWS
+    carry = jax.lax.fori_loop(0, count // GRAM_ROWS, lambda i, c: add(part(i * GRAM_ROWS, GRAM_ROWS), c), carry)
+    return add(part(count - last, last), carry) if last else carry
+
+
+def whiten_on(
+    state: Float[Array, "state column *cell"], filter: Filter, columns: Float[Array, "sample column"]
+) -> tuple[Float[Array, "state column *cell"], Float[Array, "sample column *cell"]]:
+    """The state after some rows that follow on `state`, and these rows whitened."""
+    cells = state.ndim - 2
 
     def step(state, inputs):
         transition, gain, scale, present, row = inputs
-        state = transition[:, None] * state
-        innovation = jnp.where(present, row - state.sum(0), 0.0)
+        state = _over_cells(transition[:, None], cells) * state
+        innovation = jnp.where(present, _over_cells(row, cells) - state.sum(0), 0.0)
         return state + gain[:, None] * innovation, innovation / scale
 
     rows = jnp.where(filter.present[:, None], columns, 0.0)
@@ -135,20 +196,24 @@ def whiten_transposed(filter: Filter, columns: Float[Array, "sample column"]) ->
     return jax.lax.scan(step, start, (*filter, columns), reverse=True)[1]
 
 
-def step_and_pulse_energy(filter: Filter) -> tuple[Float[Array, " sample"], Float[Array, " sample"]]:
+def step_and_pulse_energy(filter: Filter) -> tuple[Float[Array, "sample ..."], Float[Array, "sample ..."]]:
     """Squared norms of a whitened unit step from each sample on, and of a whitened unit pulse at each, in one pass."""
-    states = filter.gain.shape[1]
-    zero, one = jnp.zeros(1), jnp.ones(1)
+    states, cells = filter.gain.shape[1], filter.gain.ndim - 2
+    none, one = jnp.zeros((1, *filter.gain.shape[2:])), jnp.ones(1)
+    observed = _over_cells(jnp.concatenate([one, -jnp.ones(states)]), cells)
 
     def step(weight, inputs):
         transition, gain, scale, present = inputs
-        # State (1, m): m <- φm at arrival, innovation 1 - Σm, m <- m + gain·innovation. `weight` measures what follows.
-        arrive = jnp.concatenate([one, transition])
-        observe = jnp.where(present, jnp.concatenate([one, -jnp.ones(states)]), 0.0)
-        update = jnp.eye(states + 1) + jnp.outer(jnp.concatenate([zero, gain]), observe)
-        here = update.T @ weight @ update + jnp.outer(observe, observe) / scale**2
-        pulse = jnp.where(present, 1.0 / scale**2 + gain @ weight[1:, 1:] @ gain, 0.0)
-        return arrive[:, None] * here * arrive, (here[0, 0], pulse)
+        # State (1, m): m <- φm at arrival, innovation 1 - Σm, m <- m + gain·innovation. `weight` measures what follows:
+        # seen from before the update it is (I + g oᵀ)ᵀ W (I + g oᵀ) + o oᵀ/scale², o being what is observed.
+        g = jnp.concatenate([none, gain])
+        o = jnp.where(present, observed, 0.0)
+        by_gain = (weight * g).sum(1)
+        pulse = (g * by_gain).sum(0) + 1.0 / scale**2
+        cross = o[:, None] * by_gain
+        here = weight + cross + cross.swapaxes(0, 1) + pulse * o[:, None] * o
+        arrive = _over_cells(jnp.concatenate([one, transition]), cells)
+        return arrive[:, None] * here * arrive, (here[0, 0], jnp.where(present, pulse, 0.0))
 
-    start = jnp.zeros((states + 1, states + 1))
+    start = jnp.zeros((states + 1, states + 1, *filter.gain.shape[2:]))
     return jax.lax.scan(step, start, tuple(filter), reverse=True)[1]

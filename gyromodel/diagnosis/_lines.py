@@ -1,0 +1,85 @@
+"""Lines at every frequency: the grid that is searched, and the energy of a cosine and sine in coloured noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import cast
+
+import numpy as np
+import scipy.fft
+
+from gyromodel.model import record_span
+from gyromodel.signals import Record
+
+# A line's energy is computed exactly at the lowest frequencies, at log-spaced ones to interpolate between, and at the
+# leading peaks of each pass, whose correction holds for their neighbours too.
+LOWEST_LINES, SPACED_LINES, PEAKS, PEAK_WIDTH = 24, 24, 12, 6
+# Fewer cycles in the record than this are a trend, not a line.
+FEWEST_CYCLES = 1.5
+
+
+@dataclass
+class LineGrid:
+    """Frequencies searched for lines (Hz) and the Fourier grid that serves them.
+
+    Attributes:
+        frequencies: searched, ascending.
+        index: each sample's place on a regular grid of times.
+        length: of the Fourier transform.
+        first: its bin at the first frequency.
+        exact: which frequencies have their energy computed in every noise cell.
+        turn: cos and sin around one turn, `length` steps.
+    """
+
+    frequencies: np.ndarray
+    index: np.ndarray
+    length: int
+    first: int
+    exact: np.ndarray
+    turn: tuple[np.ndarray, np.ndarray] = field(repr=False)
+
+    def waves(self, which: np.ndarray) -> np.ndarray:
+        """Cosines, then sines, of some frequencies by number."""
+        phase = self.index[:, None] * (self.first + which) % self.length
+        return np.concatenate([part[phase] for part in self.turn], axis=1)
+
+    def spectrum(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Inner products of columns with the cosine and with the sine of every frequency."""
+        spread = np.zeros((self.length, columns.shape[1]))
+        np.add.at(spread, self.index, columns)
+        here = slice(self.first, self.first + len(self.frequencies))
+        found = np.asarray(scipy.fft.rfft(spread, axis=0))[here]
+        return np.real(found), -np.imag(found)
+
+    def energies(self, cosine: np.ndarray, sine: np.ndarray, cross: np.ndarray) -> np.ndarray:
+        """2×2 energies at every frequency from those of the exact ones: their own, the mean interpolated between."""
+        mean = np.log(np.maximum(0.5 * (cosine + sine), 1e-300))
+        between = np.exp(np.interp(np.log(self.frequencies), np.log(self.frequencies[self.exact]), mean))
+        out = np.zeros((len(self.frequencies), 2, 2))
+        out[:, 0, 0] = out[:, 1, 1] = between
+        low = self.exact < LOWEST_LINES
+        i = self.exact[low]
+        out[i, 0, 0], out[i, 1, 1] = cosine[low], sine[low]
+        out[i, 0, 1] = out[i, 1, 0] = cross[low]
+        return out
+
+
+def line_grid(record: Record) -> LineGrid:
+    """A quarter of the record's resolution, up to half the sample rate."""
+    time = np.asarray(record.signals["time"])
+    span = record_span(record)
+    grid = record.interval
+    if np.abs(time[: record.rows] / grid - np.round(time[: record.rows] / grid)).max() > 0.1:
+        grid /= 4.0
+    grid = max(grid, span / 2**18)
+    # scipy declares no return type here.
+    length = cast(int, scipy.fft.next_fast_len(int(np.ceil(4.0 * (span + grid) / grid)), real=True))
+    first = int(np.ceil(FEWEST_CYCLES / span * length * grid))
+    frequencies = np.arange(first, length // 2 + 1) / (length * grid)
+    frequencies = frequencies[frequencies < 0.5 / record.interval * (1 - 0.5 / record.rows)]
+    exact = np.arange(min(LOWEST_LINES, len(frequencies)))
+    spaced = np.geomspace(len(exact) + 1, len(frequencies), SPACED_LINES).round().astype(int) - 1
+    exact = np.unique(np.concatenate([exact, np.clip(spaced, 0, len(frequencies) - 1)]))
+    index = np.minimum(np.round(time / grid).astype(int), length - 1)
+    angle = 2.0 * np.pi * np.arange(length) / length
+    return LineGrid(frequencies, index, length, first, exact, (np.cos(angle), np.sin(angle)))
