@@ -125,7 +125,7 @@ def run_case(
             "lasso": contest.lasso(unit, residual),
         }
     answer = run_engine(built, gain and case.noise == "white") if engine else None
-    score = judge(truth, design.name, answer) if answer else None
+    score = judge(truth, design.name, answer, isolable or not known(case.effect)) if answer else None
     return Record(case, truth, answer, score, size, isolable, first, others)
 
 

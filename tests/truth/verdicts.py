@@ -1,6 +1,8 @@
 """What counts as a right answer about a hidden effect.
 
-ACCEPTED lists every answer other than the effect's own name that is right, with the reason. Nothing else is accepted.
+ACCEPTED lists every answer other than the effect's own name that is right, with the reason. Where the campaign cannot
+isolate the effect at its size (the oracle's principal angles say so), an ambiguous set that holds it is right too.
+Nothing else is accepted.
 """
 
 from __future__ import annotations
@@ -67,8 +69,8 @@ def _allowed(truth: str, design: str) -> tuple[frozenset[str], bool]:
     return frozenset({truth}).union(*(a.stand_ins for a in rows)), any(a.ambiguous for a in rows)
 
 
-def judge(truth: Truth, design: str, answer: Answer) -> Score:
-    """Judge an answer against what was hidden."""
+def judge(truth: Truth, design: str, answer: Answer, isolable: bool = True) -> Score:
+    """Judge an answer against what was hidden; `isolable`: whether every rival separates from it on this campaign."""
     detected, firm = answer.verdict != "adequate", answer.verdict == "named"
     names = frozenset(answer.causes)
     members = names | frozenset(answer.credible)
@@ -80,7 +82,7 @@ def judge(truth: Truth, design: str, answer: Answer) -> Score:
     else:
         allowed, tolerant = _allowed(truth.effect, design)
         right = (firm and len(names) == 1 and names <= allowed) or (
-            tolerant and answer.verdict == "ambiguous" and truth.effect in members
+            (tolerant or not isolable) and answer.verdict == "ambiguous" and truth.effect in members
         )
     return Score(
         right=right,
