@@ -20,10 +20,12 @@ if TYPE_CHECKING:
     from gyromodel.effects import Effect as Effect
     from gyromodel.estimate import Estimate as Estimate
     from gyromodel.estimate import fit as fit
+    from gyromodel.estimate import two_stage as two_stage
     from gyromodel.files import read_campaign as read_campaign
     from gyromodel.files import write_campaign as write_campaign
     from gyromodel.model import GyroModel as GyroModel
     from gyromodel.model import model_from_effects as model_from_effects
+    from gyromodel.model import simulate as simulate
     from gyromodel.model_files import read_model as read_model
     from gyromodel.model_files import write_model as write_model
     from gyromodel.report import write_report as write_report
@@ -45,6 +47,8 @@ _MODULE_OF = {
     "model_from_effects": "model",
     "read_campaign": "files",
     "read_model": "model_files",
+    "simulate": "model",
+    "two_stage": "estimate",
     "write_campaign": "files",
     "write_model": "model_files",
     "write_report": "report",

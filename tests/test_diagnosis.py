@@ -197,9 +197,9 @@ def test_fiber_optic_rig_is_named_and_the_error_falls(measured_data) -> None:
     assert errors == sorted(errors, reverse=True)
 
 
-def stated(model: gm.GyroModel) -> gm.GyroModel:
-    """The model with white noise of 1 deg/h at 20 s stated, and nothing else."""
-    white = np.pi / 180 / 3600 * np.sqrt(20.0)
+def stated(model: gm.GyroModel, level: float = 1.0) -> gm.GyroModel:
+    """The model with white noise of `level` deg/h at 20 s stated, and nothing else."""
+    white = level * np.pi / 180 / 3600 * np.sqrt(20.0)
     return gm.GyroModel(model.effects, {"noise_white": white}, model.fixed, model.gyro)
 
 
@@ -210,6 +210,14 @@ def test_noise_that_the_model_does_not_state_is_a_cause(rng: np.random.Generator
     assert "noise_random_walk" in found.credible_set
     quiet = gm.diagnose(static_log(rng), stated(gm.model_from_effects(["bias"])), hold_out=False)
     assert quiet.verdict == "adequate"
+    assert not any("The noise is" in line for line in quiet.findings)
+
+
+def test_a_stated_noise_level_is_held_against_the_data(rng: np.random.Generator) -> None:
+    found = gm.diagnose(static_log(rng), stated(gm.model_from_effects(["bias"]), 0.5), hold_out=False)
+    said = next(line for line in found.findings if line.startswith("The noise is "))
+    # 256 samples: a standard deviation to 4.4 %.
+    assert float(said.split()[3]) == pytest.approx(2.0, abs=0.4)
 
 
 def test_slope_is_the_derivative_by_rate() -> None:

@@ -27,7 +27,7 @@ from gyromodel.diagnosis._search import (
     search,
     standing,
 )
-from gyromodel.diagnosis._variance import growing_noise, tails, with_variance
+from gyromodel.diagnosis._variance import growing_noise, noise_level, tails, with_variance
 from gyromodel.diagnosis._verdict import driver_shape, judge, minimum_detectable, testable
 from gyromodel.estimate import Estimate, fit_record
 from gyromodel.model import GyroModel, record_span
@@ -123,8 +123,7 @@ def diagnose(
         baseline = fit_record(record, model)
         session = _Session(Scanner(record, bank, grid, stated=baseline.noise_given), session.threshold)
         selection = (session.run_and_prune if hold_out else session.run)(baseline, say)
-    heavy = tails(selection.estimate)
-    findings += [heavy] if heavy else []
+    findings += [line for line in (tails(selection.estimate), noise_level(selection.estimate)) if line]
     say("judging", 0.65)
     unit = _rate_unit(campaigns[0])
     scale = factor("rad/s", unit)

@@ -11,6 +11,8 @@ from gyromodel.signals import Record
 
 SIGNIFICANT = 1e-5
 HEAVY = 6.0
+# Two-sided significance at which a stated noise level is contradicted.
+CONTRADICTED = 1e-4
 
 
 def variance_drivers(record: Record) -> dict[str, np.ndarray]:
@@ -77,4 +79,20 @@ def tails(estimate: Estimate) -> str | None:
         return None
     return (
         f"Residuals have heavy tails (excess kurtosis {excess:.1f}): intervals that assume normal noise are optimistic."
+    )
+
+
+def noise_level(estimate: Estimate) -> str | None:
+    """A sentence where the residuals' level contradicts the noise that the model states."""
+    if not estimate.noise_given:
+        return None
+    gain = float(estimate.model.gain())
+    stated = float(estimate.model.noise["noise_white"] * gain) ** 2 / estimate.record.interval
+    nu = estimate.degrees_of_freedom
+    ratio = estimate.white_variance / stated
+    if 2 * min(stats.chi2.sf(nu * ratio, nu), stats.chi2.cdf(nu * ratio, nu)) > CONTRADICTED:
+        return None
+    return (
+        f"The noise is {np.sqrt(ratio):.2f} times as large as the model states; uncertainties are those of "
+        "the level in the data."
     )

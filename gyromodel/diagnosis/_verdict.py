@@ -17,7 +17,7 @@ from gyromodel.effects import Effect
 from gyromodel.estimate import Estimate
 from gyromodel.model import effect_class, parameter_unit
 from gyromodel.signals import Record
-from gyromodel.units import factor, internal_unit
+from gyromodel.units import factor, from_internal, internal_unit
 
 # Share of the posterior that the credible set holds.
 CREDIBLE = 0.95
@@ -335,8 +335,6 @@ def driver_shape(scanner: Scanner, selection: Selection, name: str, unit: str) -
     order = np.argsort(x)[:: max(1, record.rows // 300)]
     scale = factor("rad/s", unit)
     label = " and ".join(smooth_columns(name))
-    from gyromodel.units import from_internal
-
     return Driver(label, file_unit, from_internal(x[order], file_unit), value[order] * scale, std[order] * scale, unit)
 
 

@@ -2,5 +2,6 @@
 
 from gyromodel.estimate._estimate import Estimate, EstimateError
 from gyromodel.estimate._fit import filter_of, fit, fit_record, make_filter, whiten_columns
+from gyromodel.estimate._two_stage import two_stage
 
-__all__ = ["Estimate", "EstimateError", "filter_of", "fit", "fit_record", "make_filter", "whiten_columns"]
+__all__ = ["Estimate", "EstimateError", "filter_of", "fit", "fit_record", "make_filter", "two_stage", "whiten_columns"]

@@ -33,7 +33,7 @@ class ParameterRow(NamedTuple):
 
 @dataclass(frozen=True)
 class Estimate:
-    """A fitted model.
+    """A fitted model; there is none of a fit that did not converge.
 
     Attributes:
         model: at the estimate; its noise coefficients are filled in.
@@ -57,7 +57,6 @@ class Estimate:
     ratios: NoiseRatios = field(repr=False)
     white_variance: float
     log_likelihood: float
-    converged: bool
     iterations: int
     record: Record = field(repr=False)
     noise_given: bool = False
@@ -123,7 +122,6 @@ class Estimate:
             "parameters": [row._asdict() for row in self.table()],
             "noise": self.noise_table(),
             "degrees_of_freedom": self.degrees_of_freedom,
-            "converged": self.converged,
             "iterations": self.iterations,
             "samples": int(self.record.present.sum()),
             "missing": int(self.record.rows - self.record.present.sum()),

@@ -45,7 +45,7 @@ def fit(
         progress: called with a line and the fraction done.
 
     Raises:
-        EstimateError: the campaign does not determine some combination of parameters.
+        EstimateError: the campaign does not determine some combination of parameters, or the fit did not converge.
         ModelError: the model needs columns the campaign lacks.
     """
     record = read_signals(campaigns)
@@ -100,6 +100,11 @@ def fit_record(
             break
     if ordinary:
         solution = solve(model, solution.x, record, filter_of(record, white), solver)
+    if not solution.converged:
+        raise EstimateError(
+            f"the fit of {', '.join(model.labels)} did not converge in {solution.iterations} iterations: "
+            "give start values near the solution, or fix some parameters"
+        )
     return _finish(record, model.with_vector(jnp.asarray(solution.x)), ratios, filter, solution, intervals, ordinary)
 
 
@@ -251,7 +256,6 @@ def _finish(
         ratios=ratios,
         white_variance=variance,
         log_likelihood=float(likelihood),
-        converged=bool(solution.converged),
         iterations=int(solution.iterations),
         record=record,
         noise_given=bool(model.noise),
