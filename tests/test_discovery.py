@@ -50,11 +50,13 @@ def test_accepted_confusions_name_catalogue_effects_and_give_reasons():
         assert row.stand_ins or row.ambiguous
 
 
+@pytest.mark.long
 def test_nothing_hidden_is_adequate(seed):
     records = study.run_cases(study.null_cases(NULLS, seed), WORKERS)
     _require(study.null_levels(records), records, seed)
 
 
+@pytest.mark.long
 def test_hidden_catalogue_effects_are_named(seed):
     sizes = ((1.0, EFFECTS_1), (3.0, EFFECTS_3), (10.0, EFFECTS_10))
     cases = [c for k, (size, n) in enumerate(sizes) for c in study.effect_cases(n, seed + k, size)]
@@ -76,6 +78,7 @@ def test_hidden_catalogue_effects_are_named(seed):
         assert right >= len(drawn) * floor, f"seed {seed}: {effect} right in {right} of {len(drawn)}\n{_told(drawn)}"
 
 
+@pytest.mark.long
 def test_uncatalogued_effects_are_unknown_and_their_driver_is_found(seed):
     cases = study.unknown_cases(UNKNOWN_3, seed, 3.0) + study.unknown_cases(UNKNOWN_10, seed + 1, 10.0)
     records = study.run_cases(cases, WORKERS)

@@ -45,3 +45,24 @@ def log_mean(values: np.ndarray) -> np.ndarray:
     """ln of the mean of exponentials over the first axis."""
     top = values.max(axis=0)
     return np.asarray(top + np.log(np.mean(np.exp(values - top), axis=0)))
+
+
+def log_mean_of_parts(values: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`log_mean` of each part of the first axis, entries of −inf not counted, and where its largest value stands.
+
+    Args:
+        values: one row an entry, one column a data set.
+        starts: first row of each part.
+
+    Returns:
+        The means, −inf where a part has no finite entry, and the row of each largest value.
+    """
+    lengths = np.diff(np.append(starts, len(values)))
+    top = np.maximum.reduceat(values, starts, axis=0)
+    spread = np.repeat(top, lengths, axis=0)
+    rows = np.where(values == spread, np.arange(len(values))[:, None], len(values))
+    finite = np.isfinite(values)
+    total = np.add.reduceat(np.exp(np.where(finite, values - np.where(finite, spread, 0.0), -np.inf)), starts, axis=0)
+    count = np.add.reduceat(finite.astype(int), starts, axis=0)
+    mean = np.where(count > 0, top + np.log(np.maximum(total, 1e-300) / np.maximum(count, 1)), -np.inf)
+    return mean, np.minimum.reduceat(rows, starts, axis=0)

@@ -20,7 +20,7 @@ from scipy.special import gammaln
 from threadpoolctl import ThreadpoolController
 
 from gyromodel.diagnosis._bank import Bank
-from gyromodel.diagnosis._evidence import log_evidence_ratio, log_mean
+from gyromodel.diagnosis._evidence import log_evidence_ratio, log_mean, log_mean_of_parts
 from gyromodel.diagnosis._lines import PEAK_WIDTH, PEAKS, line_grid
 from gyromodel.diagnosis._points import explained_by, robust_order
 from gyromodel.estimate import make_filter, whiten_columns
@@ -122,12 +122,15 @@ class Scanner:
         self._layout = {
             q: (widths.index(q), widths.count(q), bank.blocks[widths.index(q)].start) for q in sorted(set(widths))
         }
-        names = [b.name for b in bank.blocks]
-        structures = np.array([b.structure for b in bank.blocks])
-        self._members = {
-            name: [np.flatnonzero(structures == s) for s in dict.fromkeys(structures[np.array(names) == name])]
-            for name in dict.fromkeys(names)
-        }
+        # Blocks of one name together and, within it, of one structure.
+        parts: dict[str, dict[str, list[int]]] = {}
+        for i, block in enumerate(bank.blocks):
+            parts.setdefault(block.name, {}).setdefault(block.structure, []).append(i)
+        structures = [blocks for of_name in parts.values() for blocks in of_name.values()]
+        self._names = list(parts)
+        self._order = np.array([i for blocks in structures for i in blocks], int)
+        self._structure_starts = np.cumsum([0, *map(len, structures)])[:-1]
+        self._name_starts = np.cumsum([0, *map(len, parts.values())])[:-1]
         self._widths = np.array([b.width for b in bank.blocks], int)
         self._positive = np.array([b.effect is not None and b.effect.positive for b in bank.blocks])
         self.epochs = np.flatnonzero(self.present[: record.rows])[1:-1]
@@ -310,17 +313,17 @@ class Scanner:
             energy[here] = np.sum(values * keep, axis=1) / np.maximum(q_of[here], 1) * np.mean(norm**2, axis=1)
         # A form that loses more columns than the baseline contains is another form in disguise.
         sound = q_of >= least
-        ratio = log_evidence_ratio(t_of, batch.rss, nu, q_of[:, None])
-        for name, structures in self._members.items():
-            batch.energy[name] = energy[np.concatenate(structures)]
-            # Structures compete by their mean over shapes; the best shape of the best structure stands for the name.
-            parts = [mine[sound[mine]] for mine in structures if sound[mine].any()]
-            if parts:
-                means = np.stack([log_mean(ratio[mine]) for mine in parts])
-                tops = np.stack([mine[np.argmax(ratio[mine], axis=0)] for mine in parts])
-                top = np.take_along_axis(tops, np.argmax(means, axis=0)[None], axis=0)[0]
-                batch.evidence[name] = log_mean(means)
-                batch.best[name] = (list(top), t_of[top, np.arange(draws)], q_of[top])
+        ratio = np.where(sound[:, None], log_evidence_ratio(t_of, batch.rss, nu, q_of[:, None]), -np.inf)[self._order]
+        # Structures compete by their mean over shapes; the best shape of the best structure stands for the name.
+        means, shapes = log_mean_of_parts(ratio, self._structure_starts)
+        evidence, best = log_mean_of_parts(means, self._name_starts)
+        forms = self._order[np.take_along_axis(shapes, best, axis=0)]
+        energies = np.split(energy[self._order], self._structure_starts[self._name_starts][1:])
+        for name, value, form, own in zip(self._names, evidence, forms, energies, strict=True):
+            batch.energy[name] = own
+            if np.isfinite(value[0]):
+                batch.evidence[name] = value
+                batch.best[name] = (list(form), t_of[form, np.arange(draws)], q_of[form])
 
     def _single(
         self, batch: Batch, name: str, where: np.ndarray, b: np.ndarray, own: np.ndarray, cross: np.ndarray, nu: int
@@ -371,16 +374,21 @@ class Scanner:
         assert self.lines is not None
         local = np.flatnonzero((t[1:-1] >= t[:-2]) & (t[1:-1] >= t[2:])) + 1
         peaks = local[np.argsort(-t[local])][:PEAKS]
-        waves = self.lines.waves(np.resize(peaks, PEAKS)) if len(peaks) else np.zeros((len(self.present), 0))
+        if not len(peaks):
+            return
+        waves = self.lines.waves(np.resize(peaks, PEAKS))
         w = np.asarray(whiten_columns(cell.filter, jnp.asarray(waves)))
-        for i, k in enumerate(peaks):
-            pair = w[:, [i, PEAKS + i]]
-            cross = np.stack([c[k], s[k]])
-            a = pair.T @ pair - cross[:, :-1] @ cross[:, :-1].T
-            sound = np.linalg.det(a) > 1e-3 * np.prod(np.sum(pair**2, axis=0))
-            right = float(cross[:, -1] @ np.linalg.solve(a, cross[:, -1])) if sound else 0.0
+        pair = w.reshape(len(w), 2, PEAKS)[:, :, : len(peaks)]
+        own = np.einsum("nik,njk->kij", pair, pair)
+        cross = np.stack([c[peaks], s[peaks]], axis=1)
+        a = own - cross[:, :, :-1] @ cross[:, :, :-1].transpose(0, 2, 1)
+        sound = np.linalg.det(a) > 1e-3 * own[:, 0, 0] * own[:, 1, 1]
+        a[~sound] = np.eye(2)
+        data = cross[:, :, -1:]
+        right = np.where(sound, (data.transpose(0, 2, 1) @ np.linalg.solve(a, data))[:, 0, 0], 0.0)
+        for k, exact in zip(peaks, right, strict=True):
             around = slice(max(k - PEAK_WIDTH, 0), k + PEAK_WIDTH + 1)
-            t[around] = np.minimum(t[around] * (right / t[k] if t[k] > 0 else 0.0), right)
+            t[around] = np.minimum(t[around] * (exact / t[k] if t[k] > 0 else 0.0), exact)
 
     def _record(
         self, batch: Batch, name: str, where: np.ndarray, t: np.ndarray, energy: np.ndarray, q: int, nu: int
