@@ -1,4 +1,4 @@
-"""How long a diagnosis of a long static log takes, where the time goes, and how long commands take to start.
+"""How long a diagnosis of a long campaign takes, where the time goes, and how long commands take to start.
 
     python -m benchmarks.diagnose_speed
 
@@ -47,8 +47,8 @@ STARTS = {
 }
 
 
-def static_log(rows: int, seed: int = 5) -> Any:
-    """Five hours at rest, temperature up and down twice, two other channels, and a Shupe bias nobody modelled."""
+def table_log(rows: int, seed: int = 5) -> Any:
+    """Five hours on a rate table, temperature up and down twice, two other channels, a Shupe bias nobody modelled."""
     from gyromodel import Campaign
 
     rng = np.random.default_rng(seed)
@@ -60,16 +60,27 @@ def static_log(rows: int, seed: int = 5) -> Any:
     shupe = 40.0 * np.gradient(temperature, step)
     white = 0.01 * 60.0 / np.sqrt(step) * rng.standard_normal(rows)
     walk = np.cumsum(rng.standard_normal(rows)) * 0.01 * np.sqrt(step / 3600.0)
+    # A new rate every five minutes, in random order.
+    levels = rng.permutation(np.linspace(-100.0, 100.0, round(12 * HOURS)))
+    rate = np.repeat(levels, -(-rows // len(levels)))[:rows]
     wander = {name: _lagged(rng.standard_normal(rows), 900.0 / step) for name in ("supply_voltage", "pressure")}
     columns = {
         "time": t,
+        "rate": rate,
         "temperature": temperature + 2e-3 * rng.standard_normal(rows),
         "supply_voltage": 5.0 + 0.03 * wander["supply_voltage"] / wander["supply_voltage"].std(),
         "pressure": 1.01e5 + 300.0 * wander["pressure"] / wander["pressure"].std(),
-        "output": 3.0 + shupe + white + walk,
+        "output": rate * (1.0 + 5e-5) + (3.0 + shupe + white + walk) / 3600.0,
     }
-    units = {"time": "s", "temperature": "degC", "supply_voltage": "V", "pressure": "Pa", "output": "deg/h"}
-    return Campaign(columns, units, {"gyro": "fog", "kind": "rate"}, "static log")
+    units = {
+        "time": "s",
+        "rate": "deg/s",
+        "temperature": "degC",
+        "supply_voltage": "V",
+        "pressure": "Pa",
+        "output": "deg/s",
+    }
+    return Campaign(columns, units, {"gyro": "fog", "kind": "rate"}, "table log")
 
 
 def _lagged(values: np.ndarray, samples: float) -> np.ndarray:
@@ -80,7 +91,7 @@ def _lagged(values: np.ndarray, samples: float) -> np.ndarray:
 
 
 def _scan_by_least_squares(campaign: Any) -> tuple[dict[str, float], int, int]:
-    """The floor: F of every block of the same columns beside a bias, white noise assumed, in numpy."""
+    """The floor: F of every block of the same columns beside bias and scale, white noise assumed, in numpy."""
     from gyromodel.diagnosis._bank import build_bank
     from gyromodel.signals import read_signals
 
@@ -88,14 +99,16 @@ def _scan_by_least_squares(campaign: Any) -> tuple[dict[str, float], int, int]:
     bank = build_bank(record)
     y = np.asarray(record.signals["output"])[: record.rows]
     columns = bank.columns[: record.rows]
+    rate = np.asarray(record.signals["rate"])[: record.rows]
+    base = np.linalg.qr(np.column_stack([np.ones_like(rate), rate]))[0]
 
     def scan() -> list[float]:
-        residual = y - y.mean()
+        residual = y - base @ (base.T @ y)
         rss = residual @ residual
         found = []
         for block in bank.blocks:
             c = columns[:, block.start : block.start + block.width]
-            c = c - c.mean(0)
+            c = c - base @ (base.T @ c)
             gram, inner = c.T @ c, c.T @ residual
             explained = inner @ np.linalg.lstsq(gram, inner, rcond=1e-12)[0]
             found.append(explained / block.width / ((rss - explained) / (len(y) - 1 - block.width)))
@@ -124,8 +137,8 @@ def _measure(rows: int, profiled: bool) -> dict[str, Any]:
     """Two diagnoses in this process; the second under the profiler if asked."""
     import gyromodel
 
-    campaign = static_log(rows)
-    model = gyromodel.model_from_effects(["bias"], gyro="fog")
+    campaign = table_log(rows)
+    model = gyromodel.model_from_effects(["scale_factor", "bias"], gyro="fog")
     before = peak_memory()
     profile = cProfile.Profile()
 
@@ -201,8 +214,8 @@ def main(argv: list[str] | None = None) -> None:
 
     head = ["", "calls", "s", "share"]
     lines = [
-        f"{args.rows:,} samples of a static log ({HOURS:g} h, temperature up and down twice, supply voltage and "
-        f"pressure recorded), a Shupe bias hidden, a model of a bias alone: {plain['candidates']} candidates "
+        f"{args.rows:,} samples on a rate table ({HOURS:g} h, temperature up and down twice, supply voltage and "
+        f"pressure recorded), a Shupe bias hidden, a model of scale factor and bias: {plain['candidates']} candidates "
         f"({profiled['blocks']} forms, {profiled['columns']} columns, besides steps and outliers at every epoch and "
         f"lines at every frequency), {plain['folds']} held-out blocks. The answer: {plain['verdict']}, "
         f"{', '.join(plain['causes']) or 'nothing'}.",

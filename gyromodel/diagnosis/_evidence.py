@@ -18,10 +18,10 @@ def log_evidence_ratio(t: np.ndarray, rss: np.ndarray | float, nu: int, q: np.nd
     """ln B of adding q columns that explain `t` of the residual sum `rss` with ν degrees of freedom."""
     part = np.clip(t / rss, 0.0, 1.0)
     half = 0.5 * np.asarray(q, float)
-    total = np.full(np.shape(part), -np.inf)
-    for size in SIZES:
-        total = np.logaddexp(total, -0.5 * nu * np.log1p(-size / (1.0 + size) * part) - half * np.log1p(size))
-    return np.asarray(total - np.log(len(SIZES)))
+    # Plain log and exp, which processors vectorise; 1 − part loses nothing that matters times ν.
+    each = [-0.5 * nu * np.log(1.0 - size / (1.0 + size) * part) - half * np.log1p(size) for size in SIZES]
+    top = np.maximum.reduce(each)
+    return np.asarray(top + np.log(sum(np.exp(e - top) for e in each) / len(SIZES)))
 
 
 def explained_for(log_ratio: float, nu: int, q: int) -> float:

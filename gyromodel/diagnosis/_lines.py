@@ -45,10 +45,9 @@ class LineGrid:
 
     def spectrum(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Inner products of columns with the cosine and with the sine of every frequency."""
-        spread = np.zeros((self.length, columns.shape[1]))
-        np.add.at(spread, self.index, columns)
+        spread = np.stack([np.bincount(self.index, column, self.length) for column in columns.T])
         here = slice(self.first, self.first + len(self.frequencies))
-        found = np.asarray(scipy.fft.rfft(spread, axis=0))[here]
+        found = np.asarray(scipy.fft.rfft(spread, axis=1))[:, here].T
         return np.real(found), -np.imag(found)
 
     def energies(self, cosine: np.ndarray, sine: np.ndarray, cross: np.ndarray) -> np.ndarray:

@@ -395,9 +395,12 @@ class Scanner:
     ) -> None:
         if not len(where):
             return
-        t = np.minimum(t, batch.rss)
-        ratio = log_evidence_ratio(t, batch.rss, nu, q)
-        top = np.argmax(ratio, axis=0)
-        batch.evidence[name] = log_mean(ratio)
-        batch.best[name] = (list(where[top]), t[top, np.arange(t.shape[1])], np.full(t.shape[1], float(q)))
+        evidence, top = np.zeros(t.shape[1]), np.zeros(t.shape[1], int)
+        # A data set at a time, which stays in cache.
+        for i, (of_one, rss) in enumerate(zip(t.T, batch.rss, strict=True)):
+            ratio = log_evidence_ratio(np.minimum(of_one, rss), rss, nu, q)
+            evidence[i], top[i] = log_mean(ratio), np.argmax(ratio)
+        best = np.minimum(t[top, np.arange(len(top))], batch.rss)
+        batch.evidence[name] = evidence
+        batch.best[name] = (list(where[top]), best, np.full(len(top), float(q)))
         batch.energy[name] = energy
