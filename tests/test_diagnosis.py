@@ -220,6 +220,26 @@ def test_a_stated_noise_level_is_held_against_the_data(rng: np.random.Generator)
     assert float(said.split()[3]) == pytest.approx(2.0, abs=0.4)
 
 
+def test_several_lines_are_one_cause(rng: np.random.Generator) -> None:
+    time = 20.0 * np.arange(ROWS)
+    lines = 3 * np.sin(2 * np.pi * 0.0031 * time) + 2 * np.cos(2 * np.pi * 0.0117 * time + 1)
+    found = gm.diagnose(static_log(rng, lines), gm.model_from_effects(["bias"]), hold_out=False)
+    assert found.verdict == "named"
+    assert [c.effect for c in found.causes] == ["bias_periodic"]
+    assert found.extended.model.labels == ("bias", "bias_periodic")
+    frequency = np.sort(found.extended.model.effects[1].frequency)  # type: ignore[attr-defined]
+    # Standard error of a frequency: √6 σ / (π A T √n).
+    tolerance = 6 * np.sqrt(6) / (np.pi * 2 * time[-1] * np.sqrt(ROWS))
+    assert frequency == pytest.approx([0.0031, 0.0117], abs=tolerance)
+
+
+def test_many_steps_are_a_function_of_time_and_no_cause(rng: np.random.Generator) -> None:
+    levels = 30.0 * rng.permutation(np.arange(8)).repeat(ROWS // 8)
+    found = gm.diagnose(static_log(rng, levels), gm.model_from_effects(["bias"]), hold_out=False)
+    assert found.verdict != "named"
+    assert "bias_step" not in [c.effect for c in found.causes]
+
+
 def test_slope_is_the_derivative_by_rate() -> None:
     rate = np.linspace(-2.0, 2.0, 64)
     signals = {"time": jnp.arange(64.0), "rate": jnp.asarray(rate)}

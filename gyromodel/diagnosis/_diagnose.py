@@ -58,9 +58,8 @@ class _Session:
         """The rounds."""
         return search(self.record, self.scanner, baseline, self.threshold, progress=progress, noise=noise)
 
-    def run_and_prune(self, baseline: Estimate, progress: Progress = None) -> Selection:
+    def pruned(self, selection: Selection) -> Selection:
         """The rounds, cut where (after the first step) the error on blocks left out stops falling."""
-        selection = self.run(baseline, progress)
         for i in range(2, len(selection.estimates)):
             now, before = self.ladder(selection.estimates[i]), self.ladder(selection.estimates[i - 1])
             if selection.path[i - 1].effect is not None and now[0] > before[0] and now[1] < before[1]:
@@ -114,15 +113,17 @@ def diagnose(
     if calibrate:
         nulls = null_scores(session.scanner, baseline, calibrate, seed, say)
         session.threshold = float(np.quantile(nulls, 0.99))
-    look = session.run_and_prune if hold_out else session.run
-    selection = look(baseline, say)
+    selection = session.run(baseline, say)
     grows = growing_noise(record, selection.estimate)
     if grows is not None:
         findings.append(f"The noise level follows {grows[0]}; samples are weighted accordingly.")
         record = with_variance(record, grows[1])
         baseline = fit_record(record, model)
         session = _Session(Scanner(record, bank, grid, stated=baseline.noise_given), session.threshold)
-        selection = (session.run_and_prune if hold_out else session.run)(baseline, say)
+        selection = session.run(baseline, say)
+    if hold_out:
+        say("judging each step on blocks left out", 0.62)
+        selection = session.pruned(selection)
     findings += [line for line in (tails(selection.estimate), noise_level(selection.estimate)) if line]
     say("judging", 0.65)
     unit = _rate_unit(campaigns[0])

@@ -75,17 +75,22 @@ class CellResult:
     evidence: dict[str, float]
     best: dict[str, tuple[int | tuple[int, ...], float, float]]
     energy: dict[str, np.ndarray]
+    peaks: dict[int, float]
 
 
 @dataclass
 class Batch:
-    """A cell's results for several residuals: arrays have one entry a residual; `energy` is theirs in common."""
+    """A cell's results for several residuals: arrays have one entry a residual; `energy` is theirs in common.
+
+    `peaks` are the leading lines of a single residual: what each explains, by number of its frequency.
+    """
 
     log_likelihood: np.ndarray
     rss: np.ndarray
     evidence: dict[str, np.ndarray]
     best: dict[str, tuple[list, np.ndarray, np.ndarray]]
     energy: dict[str, np.ndarray]
+    peaks: dict[int, float]
 
     def first(self) -> CellResult:
         """The first residual's results as plain numbers."""
@@ -94,7 +99,7 @@ class Batch:
             for name, (form, t, q) in self.best.items()
         }
         evidence = {name: float(v[0]) for name, v in self.evidence.items()}
-        return CellResult(float(self.log_likelihood[0]), float(self.rss[0]), evidence, best, self.energy)
+        return CellResult(float(self.log_likelihood[0]), float(self.rss[0]), evidence, best, self.energy, self.peaks)
 
 
 class Scanner:
@@ -274,7 +279,7 @@ class Scanner:
         rss = np.maximum(np.sum(x[:, p:] * z[:, p:], axis=0) - np.sum(jy**2, axis=0), 1e-300)
         nu = int(self.present.sum()) - p
         log_j = 2.0 * np.log(norm).sum() + np.linalg.slogdet(scaled)[1]
-        batch = Batch(-0.5 * cell.log_determinant - 0.5 * log_j - 0.5 * nu * np.log(rss), rss, {}, {}, {})
+        batch = Batch(-0.5 * cell.log_determinant - 0.5 * log_j - 0.5 * nu * np.log(rss), rss, {}, {}, {}, {})
         zj = z[:, :p] @ root.T
         zy = z[:, p:] - zj @ jy
         self._blocks(batch, cell, zj, zy, nu, least)
@@ -366,16 +371,16 @@ class Scanner:
         bc, bs = c[:, p:], s[:, p:]
         t = weight * (a22[:, None] * bc**2 - 2 * a12[:, None] * bc * bs + a11[:, None] * bs**2)
         if t.shape[1] == 1:
-            self._exact_peaks(cell, t[:, 0], c, s)
+            batch.peaks = self._exact_peaks(cell, t[:, 0], c, s)
         self._record(batch, "bias_periodic", np.arange(len(t)), t, np.where(keep, a11, 0.0), 2, nu)
 
-    def _exact_peaks(self, cell: Cell, t: np.ndarray, c: np.ndarray, s: np.ndarray) -> None:
-        """Correct the statistic around the leading peaks, in place, by their exact energy."""
+    def _exact_peaks(self, cell: Cell, t: np.ndarray, c: np.ndarray, s: np.ndarray) -> dict[int, float]:
+        """Correct the statistic around the leading peaks, in place, by their exact energy; what each explains."""
         assert self.lines is not None
         local = np.flatnonzero((t[1:-1] >= t[:-2]) & (t[1:-1] >= t[2:])) + 1
         peaks = local[np.argsort(-t[local])][:PEAKS]
         if not len(peaks):
-            return
+            return {}
         waves = self.lines.waves(np.resize(peaks, PEAKS))
         w = np.asarray(whiten_columns(cell.filter, jnp.asarray(waves)))
         pair = w.reshape(len(w), 2, PEAKS)[:, :, : len(peaks)]
@@ -386,9 +391,12 @@ class Scanner:
         a[~sound] = np.eye(2)
         data = cross[:, :, -1:]
         right = np.where(sound, (data.transpose(0, 2, 1) @ np.linalg.solve(a, data))[:, 0, 0], 0.0)
-        for k, exact in zip(peaks, right, strict=True):
+        before = t.copy()
+        # The strongest last: side lobes of a line are peaks too, and must not overwrite it.
+        for k, exact in zip(peaks[::-1], right[::-1], strict=True):
             around = slice(max(k - PEAK_WIDTH, 0), k + PEAK_WIDTH + 1)
-            t[around] = np.minimum(t[around] * (exact / t[k] if t[k] > 0 else 0.0), exact)
+            t[around] = np.minimum(before[around] * (exact / before[k] if before[k] > 0 else 0.0), exact)
+        return {int(k): float(exact) for k, exact in zip(peaks, right, strict=True)}
 
     def _record(
         self, batch: Batch, name: str, where: np.ndarray, t: np.ndarray, energy: np.ndarray, q: int, nu: int

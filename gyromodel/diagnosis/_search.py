@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import jax.numpy as jnp
 import numpy as np
 
-from gyromodel.diagnosis._evidence import log_sum
+from gyromodel.diagnosis._evidence import log_evidence_ratio, log_sum
 from gyromodel.diagnosis._scan import CellResult, Scanner
 from gyromodel.effects import Effect
 from gyromodel.effects.drivers import BiasPeriodic, BiasStep
@@ -25,6 +25,14 @@ MAXIMUM_ROUNDS = 12
 NEARBY = 7.0
 # An earlier choice is exchanged when another candidate beats it by this many nats given all the others.
 EXCHANGE = 2.0
+# More lines than this are a spectrum, and more steps a function of time, that nobody explains by naming each.
+MAXIMUM_LINES, MAXIMUM_STEPS = 6, 3
+# A further line found in the same pass must exceed the leakage of stronger ones this many times.
+ABOVE_LEAKAGE = 4.0
+# … and have this evidence (nats) by itself, the search over frequencies paid for.
+LINE_MARGIN = 8.0
+# Lines that lead every other name by this much (nats) are not chosen again.
+LINE_LEAD = 20.0
 # Functions of time that one run cannot tell from a random walk, and the lead (nats) over it at which they are put
 # beside it.
 SLOW_IN_TIME = ("bias_drift", "bias_warmup", "bias_step")
@@ -43,9 +51,9 @@ class Ranking:
     walks: dict[int, bool] = field(repr=False)
     baseline_columns: np.ndarray = field(repr=False)
 
-    def best(self, *, drivers: bool) -> tuple[str | None, float]:
-        """The best unknown driver, or the best named candidate, and its evidence ratio (ln)."""
-        mine = {k: v for k, v in self.statistic.items() if is_driver(k) == drivers}
+    def best(self, *, drivers: bool, but: str = "") -> tuple[str | None, float]:
+        """The best unknown driver, or the best named candidate (but one), and its evidence ratio (ln)."""
+        mine = {k: v for k, v in self.statistic.items() if is_driver(k) == drivers and k != but}
         top = max(mine, key=lambda k: mine[k]) if mine else None
         return top, mine[top] if top else -np.inf
 
@@ -95,7 +103,11 @@ class Found:
 
 @dataclass(frozen=True)
 class Selection:
-    """Where the rounds ended: the extended fit, what was added, and the ranking in which no more was significant."""
+    """Where the rounds ended: the extended fit, what was added, and the ranking in which no more was significant.
+
+    `left_out` holds rankings beside everything found except one, where the search has made them; `remains` names what
+    was still significant and not added.
+    """
 
     estimate: Estimate
     found: tuple[Found, ...]
@@ -103,6 +115,8 @@ class Selection:
     last: Ranking
     estimates: tuple[Estimate, ...]
     driver: str | None
+    left_out: dict[int, Ranking] = field(default_factory=dict, repr=False)
+    remains: str = ""
 
 
 def rank(
@@ -198,19 +212,36 @@ def search(
         noise: noise ratios to hold in the fits, see `refit`.
     """
     path: list[Found] = []
-    estimates = [baseline]
+    estimates, remains = [baseline], ""
     while True:
         estimate = estimates[-1]
         pulses = tuple(r for f in path for r in f.rows)
         ranking = rank_where_it_matters(scanner, estimate, pulses)
-        name, score = ranking.best(drivers=False)
-        if len(path) >= rounds or name is None:
+        full = len(line_frequencies(estimate.model)) >= MAXIMUM_LINES
+        if full and ranking.statistic.get("bias_periodic", -np.inf) >= threshold:
+            remains = "bias_periodic"
+        name, score = ranking.best(drivers=False, but="bias_periodic" if full else "")
+        if name is None or (score < threshold and not _slow_structure(ranking, name, score, threshold)):
             break
-        if score < threshold and not _slow_structure(ranking, name, score, threshold):
+        if len(path) >= rounds:
+            remains = name
             break
+        steps = [i for i, f in enumerate(path) if f.name == "bias_step"]
+        if name == "bias_step" and len(steps) >= MAXIMUM_STEPS:
+            before = path[: steps[0]]
+            first, driver = path[steps[0]].ranking, "smooth(time)"
+            return Selection(
+                estimates[steps[0]],
+                tuple(standing(before)),
+                tuple(before),
+                first,
+                tuple(estimates[: steps[0] + 1]),
+                driver if driver in first.statistic else first.best(drivers=True)[0],
+            )
         step = _addition(scanner, estimate, ranking, name, pulses)
         after = refit(record, baseline, standing([*path, step]), noise)
         if after is None:
+            remains = name
             break
         if progress:
             progress(f"found {name}", min(0.25 + 0.06 * len(path), 0.6))
@@ -224,12 +255,12 @@ def search(
     if score > max(sum(f.ranking.statistic[f.name] for f in path) + EXCHANGE, threshold):
         # One smooth driver explains more than all the names together.
         return Selection(baseline, (), (), path[0].ranking, (baseline,), driver)
-    found = standing(path)
+    found, left_out = standing(path), {}
     if sum(f.effect is not None for f in found) > 1:
-        found, estimates[-1] = _exchange(record, scanner, baseline, found, estimates[-1], threshold, noise)
+        found, estimates[-1], left_out = _exchange(record, scanner, baseline, found, estimates[-1], threshold, noise)
     driver, score = ranking.best(drivers=True)
     driver = driver if score >= threshold else None
-    return Selection(estimates[-1], tuple(found), tuple(path), ranking, tuple(estimates), driver)
+    return Selection(estimates[-1], tuple(found), tuple(path), ranking, tuple(estimates), driver, left_out, remains)
 
 
 def standing(path: Sequence[Found]) -> list[Found]:
@@ -255,8 +286,13 @@ def _slow_structure(ranking: Ranking, name: str, score: float, threshold: float)
 
 def skipped(model: GyroModel) -> set[str]:
     """Candidates that make no sense beside a model: what it has, and what it has in a more general form."""
-    have = set(model.labels) - {"bias_step", "bias_periodic"}
-    return have | {name for e in model.effects for name in e.supersedes}
+    have = {name for e in model.effects for name in (e.label, *e.supersedes)}
+    return have - {"bias_step", "bias_periodic"}
+
+
+def line_frequencies(model: GyroModel) -> np.ndarray:
+    """Frequencies (Hz) of the lines that a model has."""
+    return np.concatenate([np.zeros(0), *(np.ravel(e.frequency) for e in model.effects if isinstance(e, BiasPeriodic))])
 
 
 def _addition(scanner: Scanner, estimate: Estimate, ranking: Ranking, name: str, pulses: tuple[int, ...]) -> Found:
@@ -270,7 +306,30 @@ def _addition(scanner: Scanner, estimate: Estimate, ranking: Ranking, name: str,
     assert isinstance(form, int)
     effect = form_effect(scanner, name, form)
     assert effect is not None
+    if isinstance(effect, BiasPeriodic):
+        frequency = np.append(line_frequencies(estimate.model), _lines(scanner, ranking, estimate.model))
+        none = jnp.zeros(len(frequency))
+        effect = BiasPeriodic(cosine=none, sine=none, frequency=jnp.asarray(frequency))
     return Found(name, _solved(scanner, estimate, effect, ranking.best_cell(name), pulses).settled(), (), ranking)
+
+
+def _lines(scanner: Scanner, ranking: Ranking, model: GyroModel) -> np.ndarray:
+    """Frequencies of the best line and of others in the same pass that stand by themselves."""
+    assert scanner.lines is not None
+    result = ranking.results[ranking.best_cell("bias_periodic")]
+    form, explained, _ = result.best["bias_periodic"]
+    assert isinstance(form, int)
+    chosen = {form: explained}
+    count, nu = len(scanner.lines.frequencies), scanner.degrees_of_freedom
+    for k, t in sorted(result.peaks.items(), key=lambda item: -item[1]):
+        # A line leaks as the square of 1/(π × its distance in steps of the record's resolution, a quarter of which
+        # is the grid's).
+        leakage = sum(other / (0.25 * np.pi * max(abs(k - j), 1e-3)) ** 2 for j, other in chosen.items())
+        alone = float(log_evidence_ratio(np.array(t), result.rss, nu, 2)) - np.log(count)
+        if alone > LINE_MARGIN and t > ABOVE_LEAKAGE * leakage:
+            chosen[k] = t
+    room = max(MAXIMUM_LINES - len(line_frequencies(model)), 1)
+    return scanner.lines.frequencies[list(chosen)[:room]]
 
 
 def form_effect(scanner: Scanner, name: str, form: int) -> Effect | None:
@@ -280,15 +339,17 @@ def form_effect(scanner: Scanner, name: str, form: int) -> Effect | None:
         return BiasStep(epoch=jnp.asarray(float(time[form] + time[form - 1]) / 2))
     if name == "bias_periodic":
         assert scanner.lines is not None
-        return BiasPeriodic(frequency=jnp.asarray(float(scanner.lines.frequencies[form])))
+        return BiasPeriodic(frequency=jnp.asarray(scanner.lines.frequencies[[form]]))
     return scanner.bank.blocks[form].effect
 
 
 def _solved(scanner: Scanner, estimate: Estimate, effect: Effect, g: int, pulses: tuple[int, ...]) -> Effect:
     """The effect at the coefficients that fit best beside the baseline, in one noise cell."""
     record = scanner.record
-    predicted, jacobian = estimate.model.linearise(record.signals)
-    columns = estimate.model.columns_of(effect, record.signals)
+    model = estimate.model
+    model = GyroModel(tuple(e for e in model.effects if e.label not in effect.supersedes), {}, model.fixed, model.gyro)
+    predicted, jacobian = model.linearise(record.signals)
+    columns = model.columns_of(effect, record.signals)
     residual = jnp.where(record.sampling.present, record.signals["output"] - predicted, 0.0)
     marks = jnp.zeros((len(residual), len(pulses))).at[jnp.asarray(pulses, int), jnp.arange(len(pulses))].set(1.0)
     stacked = jnp.column_stack([jacobian, marks, columns, residual])
@@ -344,6 +405,17 @@ def replace_fixed(model: GyroModel, fixed: frozenset[tuple[str, str]]) -> GyroMo
     return GyroModel(model.effects, model.noise, fixed, model.gyro)
 
 
+def uncontested(step: Found) -> bool:
+    """Whether it is lines that led every other name by far when they were added: nothing else makes a line."""
+    rivals = [v for k, v in step.ranking.statistic.items() if k not in (step.name, "outliers") and not is_driver(k)]
+    own = step.ranking.statistic.get(step.name, -np.inf)
+    return step.name == "bias_periodic" and own > max(rivals, default=-np.inf) + LINE_LEAD
+
+
+def _has_lines(found: Sequence[Found]) -> bool:
+    return any(f.name == "bias_periodic" for f in found)
+
+
 def leave_one_out(
     record: Record, scanner: Scanner, baseline: Estimate, found: list[Found], i: int, noise: NoisePath = ()
 ) -> Ranking | None:
@@ -364,15 +436,19 @@ def _exchange(
     estimate: Estimate,
     threshold: float,
     noise: NoisePath,
-) -> tuple[list[Found], Estimate]:
-    """Re-choose each earlier addition given all the others."""
+) -> tuple[list[Found], Estimate, dict[int, Ranking]]:
+    """Re-choose each earlier addition given all the others; also the rankings that speak of what was kept."""
+    rankings: dict[int, Ranking] = {}
     for i in range(len(found)):
-        if found[i].effect is None:
+        if found[i].effect is None or uncontested(found[i]):
             continue
         ranking = leave_one_out(record, scanner, baseline, found, i, noise)
         if ranking is None:
             continue
-        name, score = ranking.best(drivers=False)
+        rankings[i] = ranking
+        others = found[:i] + found[i + 1 :]
+        # Further lines would come on top of the others, not in the place of this one.
+        name, score = ranking.best(drivers=False, but="bias_periodic" if _has_lines(others) else "")
         own = ranking.statistic.get(found[i].name, -np.inf)
         if (
             name is None
@@ -381,7 +457,6 @@ def _exchange(
             or score < max(own + EXCHANGE, threshold)
         ):
             continue
-        others = found[:i] + found[i + 1 :]
         base = refit(record, baseline, others, noise)
         if base is None:
             continue
@@ -389,5 +464,5 @@ def _exchange(
         changed = [*others[:i], step, *others[i:]]
         after = refit(record, baseline, changed, noise)
         if after is not None:
-            found, estimate = changed, after
-    return found, estimate
+            found, estimate, rankings = changed, after, {i: ranking}
+    return found, estimate, rankings

@@ -12,7 +12,16 @@ from gyromodel.diagnosis._bank import smooth_columns
 from gyromodel.diagnosis._evidence import explained_for
 from gyromodel.diagnosis._result import Cause, Confuser, Driver, ParameterValue, Verdict
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._search import SLOW_IN_TIME, Found, Ranking, Selection, form_effect, is_driver, leave_one_out
+from gyromodel.diagnosis._search import (
+    SLOW_IN_TIME,
+    Found,
+    Ranking,
+    Selection,
+    form_effect,
+    is_driver,
+    leave_one_out,
+    uncontested,
+)
 from gyromodel.effects import Effect
 from gyromodel.estimate import Estimate
 from gyromodel.model import effect_class, parameter_unit
@@ -40,9 +49,15 @@ class Judgement:
     findings: tuple[str, ...]
 
 
-def credible(ranking: Ranking, name: str, statistic: float, *, runs: int) -> dict[str, float]:
-    """The smallest set of names with 95 % of the posterior, for the cause found as `name`; forms of a family merged."""
-    own = {k: v for k, v in ranking.statistic.items() if not is_driver(k) and (k != "outliers" or name == "outliers")}
+def credible(
+    ranking: Ranking, name: str, statistic: float, *, runs: int, beside: frozenset[str] = frozenset()
+) -> dict[str, float]:
+    """The smallest set of names with 95 % of the posterior, for the cause found as `name`; forms of a family merged.
+
+    Names in `beside` come on top of this cause, not in its place.
+    """
+    apart = beside | (set() if name == "outliers" else {"outliers"})
+    own = {k: v for k, v in ranking.statistic.items() if not is_driver(k) and (k == name or k not in apart)}
     if name in SLOW_IN_TIME and runs < 2 and statistic < TIME_MARGIN and _coloured(ranking):
         own["noise_random_walk"] = max(0.0, statistic - 1.0)
     top = max(own.values())
@@ -88,12 +103,13 @@ def judge(
     runs = int(np.asarray(record.sampling.restart).sum())
     causes, sets, findings = [], [], []
     for i, step in enumerate(found):
-        ranking = (
-            step.ranking if len(found) == 1 else leave_one_out(record, scanner, baseline, found, i) or step.ranking
-        )
+        ranking = selection.left_out.get(i) or step.ranking
+        if len(found) > 1 and i not in selection.left_out and not uncontested(step):
+            ranking = leave_one_out(record, scanner, baseline, found, i) or step.ranking
         name = step.name
         statistic = ranking.statistic.get(name, step.ranking.statistic[name])
-        members = credible(ranking, name, statistic, runs=runs)
+        beside = frozenset(f.name for f in found if f is not step) | {selection.remains}
+        members = credible(ranking, name, statistic, runs=runs, beside=beside)
         if name == "outliers":
             if scanner.by_points and _unrepeated(record, step.rows):
                 members = {"outliers": members.get("outliers", 1.0) * 0.5, "scale_spline": 0.5}
@@ -107,12 +123,19 @@ def judge(
         sets.append(members)
     order = sorted(range(len(causes)), key=lambda i: -causes[i].statistic)
     causes, sets = [causes[i] for i in order], [sets[i] for i in order]
+    if selection.remains:
+        findings.append(
+            f"More remains than was named: {selection.remains} is still significant (ln B = "
+            f"{selection.last.statistic.get(selection.remains, np.nan):.0f}) and was not added."
+        )
     driver, share = _remaining(scanner, baseline, selection)
     unexplained = {" and ".join(smooth_columns(driver)): share} if driver else {}
     if driver and (not causes or share > UNKNOWN_SHARE):
         column = smooth_columns(driver)
         test = f"Vary {' and '.join(column)} alone, in steps up and down, everything else held, and repeat the run."
         return Judgement("unknown", tuple(causes), {driver: 1.0}, driver, test, unexplained, tuple(findings))
+    if not causes and selection.remains:
+        return Judgement("unknown", (), {selection.remains: 1.0}, None, None, unexplained, tuple(findings))
     if not causes:
         return Judgement("adequate", (), {}, None, None, unexplained, tuple(findings))
     if len(sets[0]) > 1:

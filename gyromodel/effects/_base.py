@@ -130,6 +130,22 @@ class Effect(eqx.Module):
         """The effect's term, in rad/s for site "rate", dimensionless for "scale"."""
         return self.columns(signals) @ self.linear()
 
+    def shape_derivatives(self, signals: Signals) -> Float[Array, "sample shape"]:
+        """Derivative of the contribution by each nonlinear parameter, in field order: by default one jvp for each."""
+        derivatives = []
+        for name, declared in self.declared().items():
+            if declared.linear:
+                continue
+            value = getattr(self, name)
+
+            def moved(v, name=name, value=value):
+                changed = eqx.tree_at(lambda e: getattr(e, name), self, jnp.reshape(v, jnp.shape(value)))
+                return changed.contribution(signals)
+
+            for direction in jnp.eye(jnp.size(value)):
+                derivatives.append(jax.jvp(moved, (jnp.ravel(value),), (direction,))[1])
+        return jnp.stack(derivatives, axis=1) if derivatives else jnp.zeros((signals["time"].shape[0], 0))
+
 
 @eqx.filter_jit
 def evaluate(
@@ -140,21 +156,7 @@ def evaluate(
     Compiled once per effect class and shape, whatever model the effect stands in.
     """
     columns = effect.columns(signals)
-    derivatives = []
-    for name, declared in effect.declared().items():
-        if declared.linear:
-            continue
-        value = getattr(effect, name)
-
-        def moved(v, name=name, value=value):
-            changed = eqx.tree_at(lambda e: getattr(e, name), effect, jnp.reshape(v, jnp.shape(value)))
-            return changed.contribution(signals)
-
-        for direction in jnp.eye(jnp.size(value)):
-            derivatives.append(jax.jvp(moved, (jnp.ravel(value),), (direction,))[1])
-    rows = columns.shape[0]
-    shapes = jnp.stack(derivatives, axis=1) if derivatives else jnp.zeros((rows, 0))
-    return columns, shapes, columns @ effect.linear()
+    return columns, effect.shape_derivatives(signals), columns @ effect.linear()
 
 
 def stack(*columns: Float[Array, " sample"]) -> Float[Array, "sample coefficient"]:

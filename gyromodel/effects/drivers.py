@@ -69,7 +69,7 @@ class BiasStep(Effect):
 
 
 class BiasPeriodic(Effect):
-    """D += A cos 2πft + B sin 2πft: a line at an unknown frequency."""
+    """D += Σ A_j cos 2πf_j t + B_j sin 2πf_j t: lines at unknown frequencies."""
 
     id = "bias_periodic"
     site = "rate"
@@ -77,15 +77,22 @@ class BiasPeriodic(Effect):
     cause = "Aliased dither, mains pick-up, chamber cycling or table harmonics."
     test = "Change the sample rate: an alias moves; log the chamber's cycle: its line is coherent with temperature."
 
+    supersedes = ("bias_periodic",)
     scan = "line"
-    cosine: Float[Array, ""] = parameter("deg/h", 1.0, "in-phase amplitude")
-    sine: Float[Array, ""] = parameter("deg/h", 1.0, "quadrature amplitude")
-    frequency: Float[Array, ""] = parameter("Hz", 0.01, "frequency", linear=False, default=0.01)
+    cosine: Float[Array, " line"] = parameter("deg/h", 1.0, "in-phase amplitude of each line", default=(0.0,))
+    sine: Float[Array, " line"] = parameter("deg/h", 1.0, "quadrature amplitude of each line", default=(0.0,))
+    frequency: Float[Array, " line"] = parameter("Hz", 0.01, "their frequencies", linear=False, default=(0.01,))
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
-        """Cosine and sine."""
-        phase = 2.0 * jnp.pi * self.frequency * signals["time"]
-        return stack(jnp.cos(phase), jnp.sin(phase))
+        """The cosines, then the sines."""
+        phase = 2.0 * jnp.pi * signals["time"][:, None] * self.frequency
+        return jnp.concatenate([jnp.cos(phase), jnp.sin(phase)], axis=1)
+
+    def shape_derivatives(self, signals: Signals) -> Float[Array, "sample shape"]:
+        """2πt (B cos 2πft − A sin 2πft), one a line: a jvp would compute every line for each."""
+        turn = 2.0 * jnp.pi * signals["time"][:, None]
+        phase = turn * self.frequency
+        return turn * (self.sine * jnp.cos(phase) - self.cosine * jnp.sin(phase))
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:

@@ -21,6 +21,8 @@ from gyromodel.signals import Record, read_signals
 Solver = Literal["levenberg_marquardt", "optimistix"]
 Progress = Callable[[str, float], None] | None
 
+# Relative decrease of the cost that still counts: at a million samples a hundredth of a standard deviation squared.
+TOLERANCE = 1e-8
 # Relative size of a singular value of the whitened, column-scaled Jacobian below which a direction is not determined.
 SINGULAR = 1e-7
 # Levels of each noise ratio over its likely range, for the intervals of the noise coefficients.
@@ -164,7 +166,7 @@ def solve(model: GyroModel, x: np.ndarray, record: Record, filter: Filter, solve
     if not len(x):
         return Solution(x, normal(x)[2], 0, True)
     if solver == "levenberg_marquardt":
-        solution = levenberg_marquardt(normal, np.asarray(x))
+        solution = levenberg_marquardt(normal, np.asarray(x), TOLERANCE)
         if solution.converged and np.isfinite(solution.x).all():
             return solution
     return optimistix_solution(model, jnp.asarray(x), record.signals, filter)

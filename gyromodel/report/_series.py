@@ -236,7 +236,7 @@ def _folded(diagnosis: Diagnosis) -> dict[str, Abscissa]:
 
     for cause in diagnosis.causes:
         for p in cause.parameters:
-            if cause.effect == "bias_periodic" and p.name == "frequency" and p.value > 0.0:
+            if cause.effect == "bias_periodic" and p.name in ("frequency", "frequency[0]") and p.value > 0.0:
                 seconds = np.asarray(diagnosis.campaign.in_unit("time", "s"), float)
                 phase = np.mod((seconds - seconds[0]) * p.value * factor(p.unit, "Hz"), 1.0)
                 return {"phase": Abscissa("phase", "phase of the period that was found", "1", phase, True)}
