@@ -23,6 +23,7 @@ import numpy as np
 from benchmarks._measure import MIB, in_fresh_process, peak_memory, table, timed, write_result
 
 MODULE = "benchmarks.diagnose_speed"
+DRAWS = 2000
 HOURS = 5.0
 FLOOR = "one plain least-squares F scan of the same columns, numpy"
 # Stages of the work: the function that does each, by file and name.
@@ -30,7 +31,7 @@ STAGES = (
     ("fits (`fit_record`)", "_fit.py", "fit_record"),
     ("of which the noise search (`best_ratios`)", "_fit.py", "best_ratios"),
     ("bank of candidates (`build_bank`)", "_bank.py", "build_bank"),
-    ("ranking (`rank`)", "_search.py", "rank"),
+    ("ranking (`rank`)", "_ranking.py", "rank"),
     ("of which noise cells (`Scanner.run`)", "_scan.py", "run"),
     ("rounds of the search (`search`)", "_search.py", "search"),
     ("held-out error of each round (`ladder_error`)", "_gain.py", "ladder_error"),
@@ -157,6 +158,9 @@ def _measure(rows: int, profiled: bool) -> dict[str, Any]:
         "candidates": len(diagnosis.searched),
         "folds": diagnosis.gain.folds,
     }
+    if not profiled:
+        for name in ("calibrated", "recalled"):
+            found[name] = timed(lambda: gyromodel.diagnose(campaign, model, calibrate=DRAWS))[1]
     if profiled:
         found["stages"], found["parts"] = _stages(profile)
         found["floor"], found["blocks"], found["columns"] = _scan_by_least_squares(campaign)
@@ -199,7 +203,11 @@ def main(argv: list[str] | None = None) -> None:
         print(json.dumps(_measure(args.rows, args.only == "profiled")))
         return
     with tempfile.TemporaryDirectory() as cache:
-        keep = {"JAX_COMPILATION_CACHE_DIR": cache, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+        keep = {
+            "XDG_CACHE_HOME": cache,
+            "JAX_COMPILATION_CACHE_DIR": cache,
+            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        }
         plain = in_fresh_process(MODULE, "--rows", str(args.rows), "--only", "plain", **keep)
         profiled = in_fresh_process(MODULE, "--rows", str(args.rows), "--only", "profiled", **keep)
     floor = profiled["floor"]
@@ -226,6 +234,8 @@ def main(argv: list[str] | None = None) -> None:
                 line("new process, nothing compiled before", plain["first"]),
                 line("new process, compilation cache filled", profiled["first"]),
                 line("second call in the process", plain["second"]),
+                line(f"then with `--calibrate {DRAWS}`, new design", plain["calibrated"]),
+                line("the same again, draws kept", plain["recalled"]),
                 [FLOOR, f"{floor['wall']:.3f}", f"{floor['cpu']:.3f}", "1"],
             ],
         ),

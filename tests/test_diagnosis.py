@@ -19,8 +19,8 @@ import gyromodel as gm
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores
 from gyromodel.diagnosis._evidence import SIZES, explained_for, log_evidence_ratio
+from gyromodel.diagnosis._ranking import rank
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._search import rank
 from gyromodel.estimate import EstimateError, fit_record
 from gyromodel.model import record_span
 from gyromodel.noise import NoiseGrid, NoiseRatios, markov_sum

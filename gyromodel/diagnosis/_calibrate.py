@@ -15,8 +15,8 @@ import jax
 import numpy as np
 
 from gyromodel import __version__
+from gyromodel.diagnosis._ranking import NEARBY, cells_of_weight, rank, skipped
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._search import NEARBY, cells_of_weight, rank, skipped
 from gyromodel.estimate import Estimate, filter_of
 from gyromodel.numerics.state_space import colour
 

@@ -13,20 +13,10 @@ from gyromodel.diagnosis._average import average
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores
 from gyromodel.diagnosis._gain import ladder_error, nested_gain, no_gain, not_measured
+from gyromodel.diagnosis._ranking import Ranking, cells_of_weight, is_driver, is_noise
 from gyromodel.diagnosis._result import Candidate, Diagnosis, Gain, Round
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._search import (
-    Found,
-    NoisePath,
-    Progress,
-    Ranking,
-    Selection,
-    cells_of_weight,
-    is_driver,
-    is_noise,
-    search,
-    standing,
-)
+from gyromodel.diagnosis._search import Found, NoisePath, Progress, Selection, search, standing
 from gyromodel.diagnosis._variance import growing_noise, noise_level, tails, with_variance
 from gyromodel.diagnosis._verdict import driver_shape, judge, minimum_detectable, testable
 from gyromodel.estimate import Estimate, fit_record

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from gyromodel.diagnosis._evidence import log_evidence_ratio, log_sum
-from gyromodel.diagnosis._scan import CellResult, Scanner
+from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise, rank_where_it_matters
+from gyromodel.diagnosis._scan import Scanner
 from gyromodel.effects import Effect
 from gyromodel.effects.drivers import BiasPeriodic, BiasStep
 from gyromodel.estimate import Estimate, EstimateError, fit_record
@@ -21,8 +22,6 @@ Progress = Callable[[str, float], None] | None
 NoisePath = Sequence[NoiseRatios]
 
 MAXIMUM_ROUNDS = 12
-# Cells within this many nats of the best, for any candidate, get their neighbours searched too.
-NEARBY = 7.0
 # An earlier choice is exchanged when another candidate beats it by this many nats given all the others.
 EXCHANGE = 2.0
 # More lines than this are a spectrum, and more steps a function of time, that nobody explains by naming each.
@@ -37,53 +36,6 @@ LINE_LEAD = 20.0
 # beside it.
 SLOW_IN_TIME = ("bias_drift", "bias_warmup", "bias_step")
 SLOW_LEAD = 2.5
-
-
-@dataclass(frozen=True)
-class Ranking:
-    """Evidence of every candidate summed over noise cells, against nothing added."""
-
-    statistic: dict[str, float]
-    posterior: dict[str, float]
-    results: dict[int, CellResult] = field(repr=False)
-    log_prior: np.ndarray = field(repr=False)
-    slow: dict[int, bool] = field(repr=False)
-    walks: dict[int, bool] = field(repr=False)
-    baseline_columns: np.ndarray = field(repr=False)
-
-    def best(self, *, drivers: bool, but: str = "") -> tuple[str | None, float]:
-        """The best unknown driver, or the best named candidate (but one), and its evidence ratio (ln)."""
-        mine = {k: v for k, v in self.statistic.items() if is_driver(k) == drivers and k != but}
-        top = max(mine, key=lambda k: mine[k]) if mine else None
-        return top, mine[top] if top else -np.inf
-
-    @property
-    def score(self) -> float:
-        """S: the best candidate's evidence ratio (ln)."""
-        return max(self.statistic.values(), default=-np.inf)
-
-    def best_cell(self, name: str | None = None) -> int:
-        """The noise cell of most weight, with a candidate added or with none."""
-
-        def weight(g: int) -> float:
-            r = self.results[g]
-            return r.log_likelihood + self.log_prior[g] + (r.evidence.get(name, -np.inf) if name else 0.0)
-
-        return max(self.results, key=weight)
-
-    def best_form(self, name: str) -> tuple[int | tuple[int, ...], float, float]:
-        """Form, explained sum and dimension of a candidate where it is best."""
-        return self.results[self.best_cell(name)].best[name]
-
-
-def is_driver(name: str) -> bool:
-    """Whether a candidate is a smooth function of measured columns, not a catalogue effect."""
-    return name.startswith("smooth(")
-
-
-def is_noise(name: str) -> bool:
-    """Whether a candidate is a kind of noise."""
-    return name.startswith("noise_")
 
 
 @dataclass(frozen=True)
@@ -119,77 +71,6 @@ class Selection:
     remains: str = ""
 
 
-def rank(
-    scanner: Scanner,
-    cells: list[int],
-    estimate: Estimate,
-    pulses: tuple[int, ...],
-    skip: set[str],
-    known: dict[int, CellResult] | None = None,
-) -> Ranking:
-    """Rank every candidate against a fitted baseline; `pulses` are gross errors, `known` cells done before."""
-    record = scanner.record
-    predicted, jacobian = estimate.model.linearise(record.signals)
-    gain = float(estimate.model.gain())
-    residual = np.where(scanner.present, np.asarray(record.signals["output"] - predicted), 0.0) / gain
-    columns = np.asarray(jacobian)
-    if pulses:
-        marks = np.zeros((len(columns), len(pulses)))
-        marks[list(pulses), np.arange(len(pulses))] = 1.0
-        columns = np.concatenate([columns, marks], axis=1)
-    contained = {
-        b.name: sum(int(e.linear().size) for e in estimate.model.effects if e.label in b.effect.supersedes)
-        for b in scanner.bank.blocks
-        if b.effect is not None and b.effect.supersedes
-    }
-    families = scanner.noise_families() if estimate.noise_given else {}
-    wanted = sorted({*cells, *(g for f in families.values() for g in f)})
-    everything = dict(known or {})
-    everything |= scanner.run([g for g in wanted if g not in everything], columns, residual, contained)
-    results = {g: everything[g] for g in cells}
-    prior = scanner.grid.log_prior
-    logs = np.array([results[g].log_likelihood + prior[g] for g in cells])
-    null = log_sum(logs)
-    statistic = {}
-    for name in sorted({n for r in results.values() for n in r.evidence} - skip):
-        each = [results[g].evidence.get(name, -np.inf) for g in cells]
-        statistic[name] = log_sum(logs + np.array(each)) - null
-    for name, family in families.items():
-        more = np.array([everything[g].log_likelihood for g in family])
-        statistic[name] = log_sum(more) - np.log(len(family)) - null
-    total = log_sum(list(statistic.values())) if statistic else 0.0
-    posterior = {k: float(np.exp(v - total)) for k, v in statistic.items()}
-    walk, flicker = scanner.grid.ratios.walk, scanner.grid.ratios.flicker
-    slow = {g: float(walk[g]) > 0 or float(flicker[g]) > 0 for g in cells}
-    walks = {g: float(walk[g]) > 0 for g in cells}
-    return Ranking(statistic, posterior, results, prior, slow, walks, columns)
-
-
-def rank_where_it_matters(scanner: Scanner, estimate: Estimate, pulses: tuple[int, ...]) -> Ranking:
-    """Rank over the noise cells that matter: every other level, then neighbours of those with weight for any."""
-    skip = skipped(estimate.model)
-    if scanner.only_cells is not None and (estimate.noise_given or not scanner.stated):
-        return rank(scanner, scanner.only_cells, estimate, pulses, skip)
-    if scanner.stated:
-        return rank(scanner, scanner.all_cells(), estimate, pulses, skip)
-    ranking = rank(scanner, scanner.coarse_cells(), estimate, pulses, skip)
-    near = set(cells_of_weight(ranking, NEARBY))
-    return rank(scanner, scanner.neighbours(near), estimate, pulses, skip, ranking.results)
-
-
-def cells_of_weight(ranking: Ranking, nats: float) -> list[int]:
-    """Noise cells within some nats of the best, for nothing added or for a candidate that matters."""
-    weights = {g: r.log_likelihood + ranking.log_prior[g] for g, r in ranking.results.items()}
-    near: set[int] = set()
-    for name in [None, *ranking.statistic]:
-        if name is not None and ranking.statistic[name] < min(ranking.score - nats, 0.0):
-            continue
-        of = {g: w + (ranking.results[g].evidence.get(name, -np.inf) if name else 0.0) for g, w in weights.items()}
-        best = max(of.values())
-        near |= {g for g, v in of.items() if v > best - nats}
-    return sorted(near)
-
-
 def search(
     record: Record,
     scanner: Scanner,
@@ -218,8 +99,7 @@ def search(
         pulses = tuple(r for f in path for r in f.rows)
         ranking = rank_where_it_matters(scanner, estimate, pulses)
         full = len(line_frequencies(estimate.model)) >= MAXIMUM_LINES
-        if full and ranking.statistic.get("bias_periodic", -np.inf) >= threshold:
-            remains = "bias_periodic"
+        remains = "bias_periodic" if full and ranking.statistic.get("bias_periodic", -np.inf) >= threshold else ""
         name, score = ranking.best(drivers=False, but="bias_periodic" if full else "")
         if name is None or (score < threshold and not _slow_structure(ranking, name, score, threshold)):
             break
@@ -228,16 +108,7 @@ def search(
             break
         steps = [i for i, f in enumerate(path) if f.name == "bias_step"]
         if name == "bias_step" and len(steps) >= MAXIMUM_STEPS:
-            before = path[: steps[0]]
-            first, driver = path[steps[0]].ranking, "smooth(time)"
-            return Selection(
-                estimates[steps[0]],
-                tuple(standing(before)),
-                tuple(before),
-                first,
-                tuple(estimates[: steps[0] + 1]),
-                driver if driver in first.statistic else first.best(drivers=True)[0],
-            )
+            return _before(steps[0], path, estimates)
         step = _addition(scanner, estimate, ranking, name, pulses)
         after = refit(record, baseline, standing([*path, step]), noise)
         if after is None:
@@ -263,6 +134,20 @@ def search(
     return Selection(estimates[-1], tuple(found), tuple(path), ranking, tuple(estimates), driver, left_out, remains)
 
 
+def _before(i: int, path: list[Found], estimates: list[Estimate]) -> Selection:
+    """The search as it stood before step i, from which on it followed time without a name."""
+    ranking, driver = path[i].ranking, "smooth(time)"
+    return Selection(
+        estimates[i],
+        tuple(standing(path[:i])),
+        tuple(path[:i]),
+        ranking,
+        tuple(estimates[: i + 1]),
+        driver if driver in ranking.statistic else None,
+        remains=path[i].name,
+    )
+
+
 def standing(path: Sequence[Found]) -> list[Found]:
     """The steps of a path that no later step replaced by a more general form."""
     later: set[str] = set()
@@ -282,12 +167,6 @@ def _slow_structure(ranking: Ranking, name: str, score: float, threshold: float)
     logs = np.array([ranking.results[g].log_likelihood + ranking.log_prior[g] for g in still])
     each = np.array([ranking.results[g].evidence.get(name, -np.inf) for g in still])
     return bool(still) and log_sum(logs + each) - log_sum(logs) > threshold
-
-
-def skipped(model: GyroModel) -> set[str]:
-    """Candidates that make no sense beside a model: what it has, and what it has in a more general form."""
-    have = {name for e in model.effects for name in (e.label, *e.supersedes)}
-    return have - {"bias_step", "bias_periodic"}
 
 
 def line_frequencies(model: GyroModel) -> np.ndarray:

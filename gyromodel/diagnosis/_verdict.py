@@ -10,18 +10,10 @@ from scipy import stats
 
 from gyromodel.diagnosis._bank import smooth_columns
 from gyromodel.diagnosis._evidence import explained_for
+from gyromodel.diagnosis._ranking import Ranking, is_driver
 from gyromodel.diagnosis._result import Cause, Confuser, Driver, ParameterValue, Verdict
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._search import (
-    SLOW_IN_TIME,
-    Found,
-    Ranking,
-    Selection,
-    form_effect,
-    is_driver,
-    leave_one_out,
-    uncontested,
-)
+from gyromodel.diagnosis._search import SLOW_IN_TIME, Found, Selection, form_effect, leave_one_out, uncontested
 from gyromodel.effects import Effect
 from gyromodel.estimate import Estimate
 from gyromodel.model import effect_class, parameter_unit
