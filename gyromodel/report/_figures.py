@@ -276,6 +276,7 @@ def _ring(axes: Axes, diagnosis: Diagnosis, x: Abscissa, y: np.ndarray, rows: np
             ha="right" if left else "left",
             va="center",
             color=draw.MARK,
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6, "alpha": 0.85},
             zorder=9,
         )
 
