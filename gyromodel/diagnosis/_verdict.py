@@ -24,6 +24,8 @@ from gyromodel.units import factor, from_internal, internal_unit
 CREDIBLE = 0.95
 # A function of time alone must beat a random walk by this much in one run: no real slow noise is exactly a random walk.
 TIME_MARGIN = 15.0
+# Where the noise has a random walk even with them, these have no edge that a walk could not make, whatever their lead.
+NO_EDGE = ("bias_drift", "bias_warmup")
 # A driver that names leave with more than this share of the structure makes the discrepancy unknown.
 UNKNOWN_SHARE = 0.05
 
@@ -50,7 +52,9 @@ def credible(
     """
     apart = beside | (set() if name == "outliers" else {"outliers"})
     own = {k: v for k, v in ranking.statistic.items() if not is_driver(k) and (k == name or k not in apart)}
-    if name in SLOW_IN_TIME and runs < 2 and statistic < TIME_MARGIN and _coloured(ranking):
+    hidden_by_walk = name in NO_EDGE and ranking.walks[ranking.best_cell(name)]
+    too_close = name in SLOW_IN_TIME and statistic < TIME_MARGIN and _coloured(ranking)
+    if runs < 2 and (hidden_by_walk or too_close):
         own["noise_random_walk"] = max(0.0, statistic - 1.0)
     top = max(own.values())
     weight = {k: float(np.exp(v - top)) for k, v in own.items()}
