@@ -51,16 +51,15 @@ class LineGrid:
         return np.real(found), -np.imag(found)
 
     def energies(self, cosine: np.ndarray, sine: np.ndarray, cross: np.ndarray) -> np.ndarray:
-        """2×2 energies at every frequency from those of the exact ones: their own, the mean interpolated between."""
-        mean = np.log(np.maximum(0.5 * (cosine + sine), 1e-300))
-        between = np.exp(np.interp(np.log(self.frequencies), np.log(self.frequencies[self.exact]), mean))
-        out = np.zeros((len(self.frequencies), 2, 2))
-        out[:, 0, 0] = out[:, 1, 1] = between
-        low = self.exact < LOWEST_LINES
-        i = self.exact[low]
-        out[i, 0, 0], out[i, 1, 1] = cosine[low], sine[low]
-        out[i, 0, 1] = out[i, 1, 0] = cross[low]
-        return out
+        """2×2 energies at every frequency from those of the exact ones, each interpolated between.
+
+        Cosine and sine differ at every frequency where the noise walks: the cosine begins with a jump.
+        """
+        x, at = np.log(self.frequencies), np.log(self.frequencies[self.exact])
+        squares = [np.maximum(e, 1e-300) for e in (cosine, sine)]
+        cc, ss = (np.exp(np.interp(x, at, np.log(e))) for e in squares)
+        cs = np.interp(x, at, cross / np.sqrt(squares[0] * squares[1])) * np.sqrt(cc * ss)
+        return np.stack([np.stack([cc, cs], axis=-1), np.stack([cs, ss], axis=-1)], axis=-2)
 
 
 def line_grid(record: Record) -> LineGrid:

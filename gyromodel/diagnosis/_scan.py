@@ -392,6 +392,8 @@ class Scanner:
         data = cross[:, :, -1:]
         right = np.where(sound, (data.transpose(0, 2, 1) @ np.linalg.solve(a, data))[:, 0, 0], 0.0)
         before = t.copy()
+        # No line that was only interpolated may beat the best that is exact.
+        np.minimum(t, right.max(), out=t)
         # The strongest last: side lobes of a line are peaks too, and must not overwrite it.
         for k, exact in zip(peaks[::-1], right[::-1], strict=True):
             around = slice(max(k - PEAK_WIDTH, 0), k + PEAK_WIDTH + 1)
