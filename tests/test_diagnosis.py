@@ -220,6 +220,27 @@ def test_a_stated_noise_level_is_held_against_the_data(rng: np.random.Generator)
     assert float(said.split()[3]) == pytest.approx(2.0, abs=0.4)
 
 
+def test_line_energies_are_the_whitened_ones(rng: np.random.Generator) -> None:
+    """At every frequency, in white noise and in a random walk, where a cosine begins with a jump and a sine does not."""
+    record = read_signals(static_log(rng))
+    ratios = NoiseRatios(jnp.array([0.0, 0.0, 0.3]), jnp.array([0.0, 0.5, 0.0]))
+    scanner = Scanner(record, build_bank(record), NoiseGrid(ratios, np.zeros(3), record.interval, record_span(record)))
+    assert scanner.lines is not None
+    waves = scanner.lines.waves(np.arange(len(scanner.lines.frequencies)))
+    for g in range(3):
+        cosine, sine = np.split(scanner.whiten(g, jnp.asarray(waves)), 2, axis=1)
+        found = scanner.cell(g).line
+        assert found[:, 0, 0] == pytest.approx(np.sum(cosine**2, axis=0), rel=0.1)
+        assert found[:, 1, 1] == pytest.approx(np.sum(sine**2, axis=0), rel=0.1)
+
+
+def test_a_missing_bias_in_a_random_walk_is_no_line(rng: np.random.Generator) -> None:
+    walk = np.cumsum(rng.normal(size=ROWS))
+    model = gm.GyroModel(gm.model_from_effects(["bias"]).effects, {}, frozenset({("bias", "value")}))
+    found = gm.diagnose(static_log(rng, 900.0 + walk), model, hold_out=False)
+    assert "bias_periodic" not in [c.effect for c in found.causes]
+
+
 def test_several_lines_are_one_cause(rng: np.random.Generator) -> None:
     time = 20.0 * np.arange(ROWS)
     lines = 3 * np.sin(2 * np.pi * 0.0031 * time) + 2 * np.cos(2 * np.pi * 0.0117 * time + 1)
