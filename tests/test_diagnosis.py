@@ -221,7 +221,7 @@ def test_a_stated_noise_level_is_held_against_the_data(rng: np.random.Generator)
 
 
 def test_line_energies_are_the_whitened_ones(rng: np.random.Generator) -> None:
-    """At every frequency, in white noise and in a random walk, where a cosine begins with a jump and a sine does not."""
+    """At every frequency, in white noise and in a random walk; there a cosine begins with a jump, a sine with none."""
     record = read_signals(static_log(rng))
     ratios = NoiseRatios(jnp.array([0.0, 0.0, 0.3]), jnp.array([0.0, 0.5, 0.0]))
     scanner = Scanner(record, build_bank(record), NoiseGrid(ratios, np.zeros(3), record.interval, record_span(record)))
@@ -234,11 +234,22 @@ def test_line_energies_are_the_whitened_ones(rng: np.random.Generator) -> None:
         assert found[:, 1, 1] == pytest.approx(np.sum(sine**2, axis=0), rel=0.1)
 
 
-def test_a_missing_bias_in_a_random_walk_is_no_line(rng: np.random.Generator) -> None:
-    walk = np.cumsum(rng.normal(size=ROWS))
-    model = gm.GyroModel(gm.model_from_effects(["bias"]).effects, {}, frozenset({("bias", "value")}))
-    found = gm.diagnose(static_log(rng, 900.0 + walk), model, hold_out=False)
-    assert "bias_periodic" not in [c.effect for c in found.causes]
+def test_many_residuals_at_once_are_searched_like_each_alone(rng: np.random.Generator) -> None:
+    """Few residuals are searched in several noise cells side by side, many in one cell at a time."""
+    record = read_signals(static_log(rng))
+    ratios = NoiseRatios(jnp.array([0.0, 0.3, 0.3]), jnp.array([0.0, 0.0, 0.5]))
+    grid = NoiseGrid(ratios, np.zeros(3), record.interval, record_span(record))
+    scanner = Scanner(record, build_bank(record), grid)
+    jacobian = np.where(scanner.present, 1.0, 0.0)[:, None]
+    residuals = rng.normal(size=(len(jacobian), 20)) * jacobian
+    together = scanner.run_many([0, 1, 2], jacobian, residuals, {})
+    alone = scanner.run([0, 1, 2], jacobian, residuals[:, 7], {})
+    for g in range(3):
+        assert together[g].log_likelihood[7] == pytest.approx(alone[g].log_likelihood, rel=1e-9)
+        for name, evidence in alone[g].evidence.items():
+            # Leading lines are corrected by their exact energy where one data set is searched.
+            within = 0.3 if name == "bias_periodic" else 1e-6
+            assert together[g].evidence[name][7] == pytest.approx(evidence, abs=within)
 
 
 def test_several_lines_are_one_cause(rng: np.random.Generator) -> None:

@@ -145,6 +145,22 @@ def test_compiled_once_whatever_the_values(rng: np.random.Generator):
     assert len(traces) == before
 
 
+def test_cells_side_by_side_are_each_alone(rng: np.random.Generator):
+    """V⁻¹x of several noises of the same decays at once."""
+    rows = 50
+    decay, variance = jnp.array([0.0, 0.2]), jnp.asarray(rng.uniform(0.0, 2.0, (2, 3)))
+    even = Sampling(jnp.ones(rows), jnp.arange(rows) == 0, jnp.asarray(rng.random(rows) < 0.8), jnp.ones(rows))
+    columns = jnp.asarray(rng.standard_normal((rows, 4)))
+
+    def precision(variance: jax.Array) -> np.ndarray:
+        filter = build_filter(MarkovSum(decay, variance), even)
+        return np.asarray(whiten_transposed(filter, whiten(filter, columns)))
+
+    together = precision(variance)
+    for cell in range(3):
+        assert together[..., cell] == pytest.approx(precision(variance[:, cell]), rel=1e-12, abs=1e-14)
+
+
 def test_long_record_keeps_its_precision(rng: np.random.Generator):
     """A process 10⁸ times the white variance, sampled 10⁴ times within its correlation time."""
     rows = 2000

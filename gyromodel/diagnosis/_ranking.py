@@ -11,8 +11,9 @@ from gyromodel.diagnosis._scan import CellResult, Scanner
 from gyromodel.estimate import Estimate
 from gyromodel.model import GyroModel
 
-# Cells within this many nats of the best, for any candidate, get their neighbours searched too.
-NEARBY = 7.0
+# Cells within this many nats of the best, for any candidate that matters, get their neighbours searched too: those
+# better than nothing added and not hopelessly behind the best.
+NEARBY, HOPELESS = 7.0, 30.0
 
 
 @dataclass(frozen=True)
@@ -124,9 +125,8 @@ def cells_of_weight(ranking: Ranking, nats: float) -> list[int]:
     """Noise cells within some nats of the best, for nothing added or for a candidate that matters."""
     weights = {g: r.log_likelihood + ranking.log_prior[g] for g, r in ranking.results.items()}
     near: set[int] = set()
-    for name in [None, *ranking.statistic]:
-        if name is not None and ranking.statistic[name] < min(ranking.score - nats, 0.0):
-            continue
+    least = min(max(ranking.score - HOPELESS, 0.0), ranking.score - nats)
+    for name in [None, *(name for name, statistic in ranking.statistic.items() if statistic >= least)]:
         of = {g: w + (ranking.results[g].evidence.get(name, -np.inf) if name else 0.0) for g, w in weights.items()}
         best = max(of.values())
         near |= {g for g, v in of.items() if v > best - nats}

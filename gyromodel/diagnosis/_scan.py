@@ -32,8 +32,13 @@ from gyromodel.signals import Record
 VANISHED = 1e-6
 COLUMN_STEP = 16
 THREADS = 2
-# Cells filtered side by side, and rows whitened at a time: they stay in cache.
-CELLS_TOGETHER, ROWS_TOGETHER = 8, 1024
+# Cells filtered side by side, rows whitened at a time, and about as many columns in one Gram matrix of whole blocks:
+# they stay in cache.
+CELLS_TOGETHER, ROWS_TOGETHER, GRAM_COLUMNS = 8, 1024, 24
+# Cells are searched side by side for at most this many columns: beyond, one alone keeps the processor busy.
+FEW_COLUMNS, FEW_STEP = 12, 4
+# Lines whose interpolated statistic, were it this much larger, would not pay for the search are left interpolated.
+PEAK_SLACK = 1.5
 # Records this short are test points, each of which may be anomalous; longer ones are series with single gross errors.
 TEST_POINTS = 40
 
@@ -211,7 +216,7 @@ class Scanner:
         """CᵀV⁻¹C of every block and line, a few rows at a time."""
         filter = Filter(*(np.asarray(part) for part in cell.filter))
         state = at_rest(cell.filter, self._raw[0].shape[1])
-        blocks: dict[int, np.ndarray] = dict.fromkeys(self._layout, np.zeros(()))
+        blocks = {q: np.zeros((count, q, q)) for q, (_, count, _) in self._layout.items()}
         first, lines = self.bank.columns.shape[1], len(self.lines.exact) if self.lines else 0
         waves = np.zeros((3, lines))
         for i, raw in enumerate(self._raw):
@@ -219,13 +224,14 @@ class Scanner:
             state, rows = _whiten_rows(state, Filter(*(part[here] for part in filter)), raw)
             w = np.asarray(rows)
             for q, (_, count, start) in self._layout.items():
-                part = w[:, start : start + q * count]
-                blocks[q] = blocks[q] + part.T @ part
+                together = max(GRAM_COLUMNS // q, 1)
+                for k in range(0, count, together):
+                    part = w[:, start + q * k : start + q * min(k + together, count)]
+                    many = part.shape[1] // q
+                    square = (part.T @ part).reshape(many, q, many, q)
+                    blocks[q][k : k + many] += square[np.arange(many), :, np.arange(many), :]
             c, s = w[:, first : first + lines], w[:, first + lines : first + 2 * lines]
             waves += np.stack([np.sum(x * y, axis=0) for x, y in ((c, c), (s, s), (c, s))])
-        for q, (_, count, _) in self._layout.items():
-            square = blocks[q].reshape(count, q, count, q)
-            blocks[q] = square[np.arange(count), :, np.arange(count), :]
         return replace(cell, blocks=blocks, line=self.lines.energies(*waves) if self.lines else NO_LINES)
 
     def whiten(self, g: int, columns: jax.Array) -> np.ndarray:
@@ -254,23 +260,42 @@ class Scanner:
         spare = np.array([contained.get(b.name, 0) for b in self.bank.blocks])
         drivers = np.array([b.kind == "driver" for b in self.bank.blocks], bool)
         least = np.where(drivers, 1, np.maximum(self._widths - spare, 1))
-        stacked = np.column_stack([jacobian, residuals])
-        pad = -stacked.shape[1] % COLUMN_STEP
-        data = jnp.asarray(np.pad(np.where(self.present[:, None], stacked, 0.0), ((0, 0), (0, pad))))
+        stacked = np.where(self.present[:, None], np.column_stack([jacobian, residuals]), 0.0)
+        p, few = jacobian.shape[1], stacked.shape[1] <= FEW_COLUMNS
+        together, step = (CELLS_TOGETHER, FEW_STEP) if few else (1, COLUMN_STEP)
+        groups = [cells[i : i + together] for i in range(0, len(cells), together)]
+        padded = jnp.asarray(np.pad(stacked, ((0, 0), (0, -stacked.shape[1] % step))))
+
+        def search(group: Sequence[int]) -> list[Batch]:
+            z, cross = self._inner_products(group, padded, stacked.shape[1])
+            return [self._run_cell(g, stacked, z[i], cross[i], p, least) for i, g in enumerate(group)]
+
         # Cells share the cores; BLAS threads on top of them would only wait for one another.
         with _libraries().limit(limits=1, user_api="blas"), ThreadPoolExecutor(THREADS) as pool:
             self._prepare([g for g in cells if g not in self.cells], pool.map)
-            return list(pool.map(lambda g: self._run_cell(g, data, jacobian.shape[1], stacked.shape[1], least), cells))
+            return [batch for group in pool.map(search, groups) for batch in group]
+
+    def _inner_products(self, group: Sequence[int], data: jax.Array, columns: int) -> tuple[np.ndarray, np.ndarray]:
+        """Per cell of a group, V⁻¹x of the data's columns and its inner products with the candidates' columns."""
+        if columns > FEW_COLUMNS:
+            z = np.asarray(_precision(self.cells[group[0]].filter, data))[:, :columns, None]
+        else:
+            filters = [self.cells[g].filter for g in np.resize(group, CELLS_TOGETHER)]
+            gain, scale = (
+                np.stack([np.asarray(getattr(f, part)) for f in filters], axis=-1) for part in ("gain", "scale")
+            )
+            z = np.asarray(_precision(filters[0]._replace(gain=gain, scale=scale), data))[:, :columns, : len(group)]
+        z = np.ascontiguousarray(z.transpose(0, 2, 1))
+        cross = self.bank.columns.T @ z.reshape(len(z), -1)
+        return z.transpose(1, 0, 2), cross.reshape(-1, len(group), columns).transpose(1, 0, 2)
 
     @property
     def degrees_of_freedom(self) -> int:
         """Samples present."""
         return int(self.present.sum())
 
-    def _run_cell(self, g: int, data: jax.Array, p: int, columns: int, least: np.ndarray) -> Batch:
+    def _run_cell(self, g: int, x: np.ndarray, z: np.ndarray, cross: np.ndarray, p: int, least: np.ndarray) -> Batch:
         cell = self.cell(g)
-        z = np.asarray(_precision(cell.filter, data))[:, :columns]
-        x = np.asarray(data)[:, :columns]
         against = x[:, :p].T @ z
         norm = np.sqrt(np.maximum(np.diag(against)[:p], 1e-300))
         scaled = against[:, :p] / np.outer(norm, norm) + 1e-13 * np.eye(p)
@@ -282,7 +307,8 @@ class Scanner:
         batch = Batch(-0.5 * cell.log_determinant - 0.5 * log_j - 0.5 * nu * np.log(rss), rss, {}, {}, {}, {})
         zj = z[:, :p] @ root.T
         zy = z[:, p:] - zj @ jy
-        self._blocks(batch, cell, zj, zy, nu, least)
+        cross_j = cross[:, :p] @ root.T
+        self._blocks(batch, cell, cross_j, cross[:, p:] - cross_j @ jy, nu, least)
         rows = self.epochs
         if self.steps:
             sj, sy = (np.cumsum(v[::-1], axis=0)[::-1][rows] for v in (zj, zy))
@@ -297,10 +323,11 @@ class Scanner:
             self._lines(batch, cell, zj, zy, nu)
         return batch
 
-    def _blocks(self, batch: Batch, cell: Cell, zj: np.ndarray, zy: np.ndarray, nu: int, least: np.ndarray) -> None:
-        cross = self.bank.columns.T @ zj
-        against = self.bank.columns.T @ zy
-        blocks, draws = len(self.bank.blocks), zy.shape[1]
+    def _blocks(
+        self, batch: Batch, cell: Cell, cross: np.ndarray, against: np.ndarray, nu: int, least: np.ndarray
+    ) -> None:
+        """Every block's evidence from inner products of its columns with the baseline's and with the residuals."""
+        blocks, draws = len(self.bank.blocks), against.shape[1]
         t_of, q_of, energy = np.zeros((blocks, draws)), np.zeros(blocks), np.zeros(blocks)
         for q, (first, count, start) in self._layout.items():
             own = cell.blocks[q]
@@ -370,7 +397,8 @@ class Scanner:
         weight = np.where(keep, 1.0 / np.where(keep, determinant, 1.0), 0.0)[:, None]
         bc, bs = c[:, p:], s[:, p:]
         t = weight * (a22[:, None] * bc**2 - 2 * a12[:, None] * bc * bs + a11[:, None] * bs**2)
-        if t.shape[1] == 1:
+        worth = log_evidence_ratio(PEAK_SLACK * t.max(axis=0), batch.rss, nu, 2) > np.log(len(t))
+        if len(worth) == 1 and worth[0]:
             batch.peaks = self._exact_peaks(cell, t[:, 0], c, s)
         self._record(batch, "bias_periodic", np.arange(len(t)), t, np.where(keep, a11, 0.0), 2, nu)
 

@@ -184,16 +184,18 @@ def colour(filter: Filter, draws: Float[Array, " sample"]) -> Float[Array, " sam
     return jax.lax.scan(step, jnp.zeros(filter.gain.shape[1]), (*filter, draws))[1]
 
 
-def whiten_transposed(filter: Filter, columns: Float[Array, "sample column"]) -> Float[Array, "sample column"]:
+def whiten_transposed(
+    filter: Filter, columns: Float[Array, "sample column *cell"]
+) -> Float[Array, "sample column *cell"]:
     """L⁻ᵀ applied to columns; after `whiten` it makes V⁻¹x."""
+    cells = columns.ndim - 2
 
     def step(adjoint, inputs):
         transition, gain, scale, present, row = inputs
-        out = jnp.where(present, row / scale + gain @ adjoint, 0.0)
-        return transition[:, None] * (adjoint - out), out
+        out = jnp.where(present, row / scale + (gain[:, None] * adjoint).sum(0), 0.0)
+        return _over_cells(transition[:, None], cells) * (adjoint - out), out
 
-    start = jnp.zeros((filter.gain.shape[1], columns.shape[1]))
-    return jax.lax.scan(step, start, (*filter, columns), reverse=True)[1]
+    return jax.lax.scan(step, at_rest(filter, columns.shape[1]), (*filter, columns), reverse=True)[1]
 
 
 def step_and_pulse_energy(filter: Filter) -> tuple[Float[Array, "sample ..."], Float[Array, "sample ..."]]:
