@@ -12,8 +12,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from gyromodel._checks import CampaignError as CampaignError
     from gyromodel.campaign import Campaign as Campaign
-    from gyromodel.campaign import CampaignError as CampaignError
     from gyromodel.diagnosis import Diagnosis as Diagnosis
     from gyromodel.diagnosis import diagnose as diagnose
     from gyromodel.effects import CATALOGUE as CATALOGUE
@@ -36,7 +36,7 @@ __version__ = "0.1.0"
 _MODULE_OF = {
     "CATALOGUE": "effects",
     "Campaign": "campaign",
-    "CampaignError": "campaign",
+    "CampaignError": "_checks",
     "Diagnosis": "diagnosis",
     "Effect": "effects",
     "Estimate": "estimate",

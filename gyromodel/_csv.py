@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from gyromodel.campaign import Campaign, CampaignError, check_time, check_unit, shown
+from gyromodel._checks import CampaignError, check_time, check_unit, shown
+from gyromodel.campaign import Campaign
 
 Contents = tuple[dict[str, np.ndarray], dict[str, str], dict[str, Any]]
 

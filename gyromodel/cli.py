@@ -25,7 +25,7 @@ DATA = Path(__file__).parent / "data"
 REPORTS = ("report.html", "diagnosis.json", "model.yaml")
 # Errors that mean "the data or the model cannot answer", by the module that defines them.
 _REFUSALS = {
-    "gyromodel.campaign": "CampaignError",
+    "gyromodel._checks": "CampaignError",
     "gyromodel.units": "UnitError",
     "gyromodel.model": "ModelError",
     "gyromodel.estimate": "EstimateError",

@@ -20,8 +20,9 @@ from typing import Any
 
 import numpy as np
 
+from gyromodel._checks import CampaignError, check_unit, shown
 from gyromodel._csv import Contents, from_text, read_csv, read_headers, to_text, write_csv, write_headers
-from gyromodel.campaign import Campaign, CampaignError, check_unit, shown
+from gyromodel.campaign import Campaign
 
 # Orders the variables of a NetCDF or Zarr file, which keep no order of their own.
 _POSITION = "column"

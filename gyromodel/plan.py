@@ -25,7 +25,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from gyromodel.campaign import Campaign, CampaignError
+from gyromodel._checks import CampaignError
+from gyromodel.campaign import Campaign
 from gyromodel.units import UnitError, convertible, factor, from_internal, quantity, to_internal
 
 _KEYS = {"duration", "interval", "output", "columns"}

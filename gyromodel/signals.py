@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from gyromodel.campaign import Campaign, CampaignError
+from gyromodel._checks import CampaignError
+from gyromodel.campaign import Campaign
 from gyromodel.numerics.smoothing import smooth_derivative
 from gyromodel.numerics.state_space import Sampling
 from gyromodel.units import internal_unit

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gyromodel.campaign import Campaign, CampaignError, check_time, short_time_slope
+from gyromodel._checks import CampaignError, check_time, short_time_slope
+from gyromodel.campaign import Campaign
 from tests.helpers import COLUMNS, METADATA, UNITS, small_campaign
 
 NAN = float("nan")

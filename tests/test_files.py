@@ -18,7 +18,8 @@ import xarray as xr
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from gyromodel.campaign import Campaign, CampaignError
+from gyromodel._checks import CampaignError
+from gyromodel.campaign import Campaign
 from gyromodel.files import read_campaign, write_campaign
 from tests.helpers import MUTANTS, SHARED_FOLDER, mutated, small_campaign
 

@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given, settings
 
 import gyromodel._csv
-from gyromodel.campaign import Campaign, CampaignError
+from gyromodel._checks import CampaignError
+from gyromodel.campaign import Campaign
 from gyromodel.files import read_campaign, write_campaign
 from tests.helpers import MUTANTS, SHARED_FOLDER, mutated, small_campaign
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gyromodel.campaign import Campaign, CampaignError
+from gyromodel._checks import CampaignError
+from gyromodel.campaign import Campaign
 from gyromodel.plan import read_plan
 
 HEAD = "gyro: fog\nkind: rate\nduration: 1 min\ninterval: 10 s\noutput: count/s\ncolumns:\n"

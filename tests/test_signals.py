@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gyromodel.campaign import Campaign, CampaignError
+from gyromodel._checks import CampaignError
+from gyromodel.campaign import Campaign
 from gyromodel.numerics.smoothing import smooth_derivative
 from gyromodel.signals import Record, padded_length, read_signals
 
