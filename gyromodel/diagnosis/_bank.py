@@ -48,6 +48,11 @@ class Bank:
         """Every candidate once: blocks, then fast scans."""
         return tuple(dict.fromkeys([b.name for b in self.blocks] + list(self.scans)))
 
+    def layout(self) -> dict[int, tuple[int, int, int]]:
+        """By width: the first block of that width, how many there are, and the first one's first column."""
+        widths = [b.width for b in self.blocks]
+        return {q: (widths.index(q), widths.count(q), self.blocks[widths.index(q)].start) for q in sorted(set(widths))}
+
 
 def driver_names(record: Record) -> tuple[str, ...]:
     """Measured columns that vary: what an unknown discrepancy may follow, besides time."""

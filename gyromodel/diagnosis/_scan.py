@@ -7,68 +7,37 @@ frequency use cumulative sums and Fourier transforms of V⁻¹r instead of colum
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.special import gammaln
 from threadpoolctl import ThreadpoolController
 
 from gyromodel.diagnosis._bank import Bank
+from gyromodel.diagnosis._cells import Cell, Cells, precision
 from gyromodel.diagnosis._evidence import log_evidence_ratio, log_mean, log_mean_of_parts
 from gyromodel.diagnosis._lines import PEAK_WIDTH, PEAKS, line_grid
 from gyromodel.diagnosis._points import explained_by, robust_order
-from gyromodel.estimate import make_filter, whiten_columns
-from gyromodel.noise import NoiseGrid, NoiseRatios
-from gyromodel.numerics.state_space import Filter, at_rest, step_and_pulse_energy, whiten, whiten_on, whiten_transposed
+from gyromodel.noise import NoiseGrid
 from gyromodel.signals import Record
 
 # A candidate whose columns keep less than this share of their energy beside the baseline cannot be tested.
 VANISHED = 1e-6
-COLUMN_STEP = 16
 THREADS = 2
-# Cells filtered side by side, rows whitened at a time, and about as many columns in one Gram matrix of whole blocks:
-# they stay in cache.
-CELLS_TOGETHER, ROWS_TOGETHER, GRAM_COLUMNS = 8, 1024, 24
-# Cells are searched side by side for at most this many columns: beyond, one alone keeps the processor busy.
-FEW_COLUMNS, FEW_STEP = 12, 4
 # Lines whose interpolated statistic, were it this much larger, would not pay for the search are left interpolated.
 PEAK_SLACK = 1.5
 # Records this short are test points, each of which may be anomalous; longer ones are series with single gross errors.
 TEST_POINTS = 40
 
-_energies = jax.jit(step_and_pulse_energy)
-_whiten_rows = jax.jit(whiten_on)
-
 
 @cache
 def _libraries() -> ThreadpoolController:
     return ThreadpoolController()
-
-
-@jax.jit
-def _precision(filter: Filter, columns):
-    return whiten_transposed(filter, whiten(filter, columns))
-
-
-@dataclass(frozen=True)
-class Cell:
-    """What one noise cell remembers between rounds."""
-
-    filter: Filter
-    log_determinant: float
-    blocks: dict[int, np.ndarray]
-    step: np.ndarray
-    pulse: np.ndarray
-    line: np.ndarray
-
-
-NO_LINES = np.zeros((0, 2, 2))
 
 
 @dataclass
@@ -123,15 +92,7 @@ class Scanner:
         self.stated = stated
         self.only_cells = self.all_cells()[: 1 if stated else None] if stated or len(grid.log_prior) == 1 else None
         self.by_points = int(self.present.sum()) <= TEST_POINTS
-        self.cells: dict[int, Cell] = {}
-        waves = self.lines.waves(self.lines.exact) if self.lines else np.zeros((len(self.present), 0))
-        raw = np.concatenate([bank.columns, waves], axis=1)
-        raw = np.pad(raw, ((0, 0), (0, -raw.shape[1] % COLUMN_STEP)))
-        self._raw = [jnp.asarray(raw[i : i + ROWS_TOGETHER]) for i in range(0, len(raw), ROWS_TOGETHER)]
-        widths = [b.width for b in bank.blocks]
-        self._layout = {
-            q: (widths.index(q), widths.count(q), bank.blocks[widths.index(q)].start) for q in sorted(set(widths))
-        }
+        self.cells = Cells(record.sampling, grid, bank, self.lines)
         # Blocks of one name together and, within it, of one structure.
         parts: dict[str, dict[str, list[int]]] = {}
         for i, block in enumerate(bank.blocks):
@@ -151,7 +112,7 @@ class Scanner:
         other.record = self.record.without(rows)
         other.present = np.asarray(other.record.sampling.present)
         other.epochs = np.flatnonzero(other.present[: other.record.rows])[1:-1]
-        other.cells, other.only_cells = {}, cells
+        other.cells, other.only_cells = self.cells.sampled(other.record.sampling), cells
         return other
 
     def all_cells(self) -> list[int]:
@@ -185,60 +146,6 @@ class Scanner:
             if any(abs(flicker[g] - flicker[c]) <= 1 and abs(walk[g] - walk[c]) <= 1 for c in cells)
         ]
 
-    def cell(self, g: int) -> Cell:
-        """The cell's memory, made at first use."""
-        if g not in self.cells:
-            self._prepare([g], map)
-        return self.cells[g]
-
-    def _prepare(self, cells: Sequence[int], each: Callable[..., Iterable]) -> None:
-        """Make the memory of these cells; `each` is `map` or a pool's."""
-        groups = [cells[i : i + CELLS_TOGETHER] for i in range(0, len(cells), CELLS_TOGETHER)]
-        made = [cell for group in each(self._filters, groups) for cell in group]
-        for g, cell in zip(cells, each(self._with_energies, made), strict=True):
-            self.cells[g] = cell
-
-    def _filters(self, cells: Sequence[int]) -> list[Cell]:
-        """Cells without their candidates' energies."""
-        index = np.resize(cells, CELLS_TOGETHER)
-        ratios = NoiseRatios(*(np.asarray(r)[index] for r in self.grid.ratios))
-        filter = make_filter(ratios, self.grid.interval, self.grid.span, self.record.sampling)
-        step, pulse = (np.asarray(e) for e in _energies(filter))
-        gain, scale = np.asarray(filter.gain), np.asarray(filter.scale)
-        log_determinant = np.asarray(filter.log_determinant)
-        made = []
-        for i in range(len(cells)):
-            own = filter._replace(gain=jnp.asarray(gain[..., i]), scale=jnp.asarray(scale[..., i]))
-            made.append(Cell(own, float(log_determinant[i]), {}, step[:, i].copy(), pulse[:, i].copy(), NO_LINES))
-        return made
-
-    def _with_energies(self, cell: Cell) -> Cell:
-        """CᵀV⁻¹C of every block and line, a few rows at a time."""
-        filter = Filter(*(np.asarray(part) for part in cell.filter))
-        state = at_rest(cell.filter, self._raw[0].shape[1])
-        blocks = {q: np.zeros((count, q, q)) for q, (_, count, _) in self._layout.items()}
-        first, lines = self.bank.columns.shape[1], len(self.lines.exact) if self.lines else 0
-        waves = np.zeros((3, lines))
-        for i, raw in enumerate(self._raw):
-            here = slice(i * ROWS_TOGETHER, (i + 1) * ROWS_TOGETHER)
-            state, rows = _whiten_rows(state, Filter(*(part[here] for part in filter)), raw)
-            w = np.asarray(rows)
-            for q, (_, count, start) in self._layout.items():
-                together = max(GRAM_COLUMNS // q, 1)
-                for k in range(0, count, together):
-                    part = w[:, start + q * k : start + q * min(k + together, count)]
-                    many = part.shape[1] // q
-                    square = (part.T @ part).reshape(many, q, many, q)
-                    blocks[q][k : k + many] += square[np.arange(many), :, np.arange(many), :]
-            c, s = w[:, first : first + lines], w[:, first + lines : first + 2 * lines]
-            waves += np.stack([np.sum(x * y, axis=0) for x, y in ((c, c), (s, s), (c, s))])
-        return replace(cell, blocks=blocks, line=self.lines.energies(*waves) if self.lines else NO_LINES)
-
-    def whiten(self, g: int, columns: jax.Array) -> np.ndarray:
-        """Columns whitened in one noise cell."""
-        padded = jnp.pad(columns, ((0, 0), (0, -columns.shape[1] % COLUMN_STEP)))
-        return np.asarray(whiten_columns(self.cell(g).filter, padded))[:, : columns.shape[1]]
-
     def run(
         self, cells: Sequence[int], jacobian: np.ndarray, residual: np.ndarray, contained: dict[str, int]
     ) -> dict[int, CellResult]:
@@ -261,33 +168,17 @@ class Scanner:
         drivers = np.array([b.kind == "driver" for b in self.bank.blocks], bool)
         least = np.where(drivers, 1, np.maximum(self._widths - spare, 1))
         stacked = np.where(self.present[:, None], np.column_stack([jacobian, residuals]), 0.0)
-        p, few = jacobian.shape[1], stacked.shape[1] <= FEW_COLUMNS
-        together, step = (CELLS_TOGETHER, FEW_STEP) if few else (1, COLUMN_STEP)
-        groups = [cells[i : i + together] for i in range(0, len(cells), together)]
-        padded = jnp.asarray(np.pad(stacked, ((0, 0), (0, -stacked.shape[1] % step))))
+        p = jacobian.shape[1]
 
         def search(group: Sequence[int]) -> list[Batch]:
-            z, cross = self._inner_products(group, padded, stacked.shape[1])
+            z, cross = self.cells.inner_products(group, stacked)
             return [self._run_cell(g, stacked, z[i], cross[i], p, least) for i, g in enumerate(group)]
 
         # Cells share the cores; BLAS threads on top of them would only wait for one another.
         with _libraries().limit(limits=1, user_api="blas"), ThreadPoolExecutor(THREADS) as pool:
-            self._prepare([g for g in cells if g not in self.cells], pool.map)
+            self.cells.prepare(cells, pool.map)
+            groups = self.cells.groups(cells, stacked.shape[1])
             return [batch for group in pool.map(search, groups) for batch in group]
-
-    def _inner_products(self, group: Sequence[int], data: jax.Array, columns: int) -> tuple[np.ndarray, np.ndarray]:
-        """Per cell of a group, V⁻¹x of the data's columns and its inner products with the candidates' columns."""
-        if columns > FEW_COLUMNS:
-            z = np.asarray(_precision(self.cells[group[0]].filter, data))[:, :columns, None]
-        else:
-            filters = [self.cells[g].filter for g in np.resize(group, CELLS_TOGETHER)]
-            gain, scale = (
-                np.stack([np.asarray(getattr(f, part)) for f in filters], axis=-1) for part in ("gain", "scale")
-            )
-            z = np.asarray(_precision(filters[0]._replace(gain=gain, scale=scale), data))[:, :columns, : len(group)]
-        z = np.ascontiguousarray(z.transpose(0, 2, 1))
-        cross = self.bank.columns.T @ z.reshape(len(z), -1)
-        return z.transpose(1, 0, 2), cross.reshape(-1, len(group), columns).transpose(1, 0, 2)
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -295,7 +186,7 @@ class Scanner:
         return int(self.present.sum())
 
     def _run_cell(self, g: int, x: np.ndarray, z: np.ndarray, cross: np.ndarray, p: int, least: np.ndarray) -> Batch:
-        cell = self.cell(g)
+        cell = self.cells[g]
         against = x[:, :p].T @ z
         norm = np.sqrt(np.maximum(np.diag(against)[:p], 1e-300))
         scaled = against[:, :p] / np.outer(norm, norm) + 1e-13 * np.eye(p)
@@ -320,7 +211,7 @@ class Scanner:
             else:
                 self._single(batch, "outliers", rows, zy[rows], cell.pulse[rows], zj[rows], nu)
         if self.lines:
-            self._lines(batch, cell, zj, zy, nu)
+            self._lines(batch, g, zj, zy, nu)
         return batch
 
     def _blocks(
@@ -329,7 +220,7 @@ class Scanner:
         """Every block's evidence from inner products of its columns with the baseline's and with the residuals."""
         blocks, draws = len(self.bank.blocks), against.shape[1]
         t_of, q_of, energy = np.zeros((blocks, draws)), np.zeros(blocks), np.zeros(blocks)
-        for q, (first, count, start) in self._layout.items():
+        for q, (first, count, start) in self.bank.layout().items():
             own = cell.blocks[q]
             c = cross[start : start + q * count].reshape(count, q, -1)
             b = against[start : start + q * count].reshape(count, q, draws)
@@ -368,7 +259,7 @@ class Scanner:
     def _test_points(self, batch: Batch, cell: Cell, zj: np.ndarray, zy: np.ndarray, rows: np.ndarray, nu: int) -> None:
         """Sets of anomalous points, up to a third of all: in the order of a robust fit, priced by their number."""
         identity = jnp.zeros((len(self.present), len(rows))).at[rows, np.arange(len(rows))].set(1.0)
-        left = np.asarray(_precision(cell.filter, identity))[rows] - zj @ zj.T
+        left = np.asarray(precision(cell.filter, identity))[rows] - zj @ zj.T
         sizes = np.arange(1, max(1, min(len(rows) // 3, nu - 1)) + 1)
         price = gammaln(len(rows) + 1) - gammaln(sizes + 1) - gammaln(len(rows) - sizes + 1) + np.log(len(sizes))
         evidence, sets, explained, dimension = [], [], [], []
@@ -385,8 +276,9 @@ class Scanner:
         batch.best["outliers"] = (sets, np.array(explained), np.array(dimension))
         batch.energy["outliers"] = np.diag(left)
 
-    def _lines(self, batch: Batch, cell: Cell, zj: np.ndarray, zy: np.ndarray, nu: int) -> None:
+    def _lines(self, batch: Batch, g: int, zj: np.ndarray, zy: np.ndarray, nu: int) -> None:
         assert self.lines is not None
+        cell = self.cells[g]
         p = zj.shape[1]
         c, s = self.lines.spectrum(np.column_stack([zj, zy]))
         a11 = cell.line[:, 0, 0] - np.sum(c[:, :p] ** 2, axis=1)
@@ -399,10 +291,10 @@ class Scanner:
         t = weight * (a22[:, None] * bc**2 - 2 * a12[:, None] * bc * bs + a11[:, None] * bs**2)
         worth = log_evidence_ratio(PEAK_SLACK * t.max(axis=0), batch.rss, nu, 2) > np.log(len(t))
         if len(worth) == 1 and worth[0]:
-            batch.peaks = self._exact_peaks(cell, t[:, 0], c, s)
+            batch.peaks = self._exact_peaks(g, t[:, 0], c, s)
         self._record(batch, "bias_periodic", np.arange(len(t)), t, np.where(keep, a11, 0.0), 2, nu)
 
-    def _exact_peaks(self, cell: Cell, t: np.ndarray, c: np.ndarray, s: np.ndarray) -> dict[int, float]:
+    def _exact_peaks(self, g: int, t: np.ndarray, c: np.ndarray, s: np.ndarray) -> dict[int, float]:
         """Correct the statistic around the leading peaks, in place, by their exact energy; what each explains."""
         assert self.lines is not None
         local = np.flatnonzero((t[1:-1] >= t[:-2]) & (t[1:-1] >= t[2:])) + 1
@@ -410,7 +302,7 @@ class Scanner:
         if not len(peaks):
             return {}
         waves = self.lines.waves(np.resize(peaks, PEAKS))
-        w = np.asarray(whiten_columns(cell.filter, jnp.asarray(waves)))
+        w = self.cells.whiten(g, jnp.asarray(waves))
         pair = w.reshape(len(w), 2, PEAKS)[:, :, : len(peaks)]
         own = np.einsum("nik,njk->kij", pair, pair)
         cross = np.stack([c[peaks], s[peaks]], axis=1)

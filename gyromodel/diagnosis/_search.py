@@ -232,7 +232,7 @@ def _solved(scanner: Scanner, estimate: Estimate, effect: Effect, g: int, pulses
     residual = jnp.where(record.sampling.present, record.signals["output"] - predicted, 0.0)
     marks = jnp.zeros((len(residual), len(pulses))).at[jnp.asarray(pulses, int), jnp.arange(len(pulses))].set(1.0)
     stacked = jnp.column_stack([jacobian, marks, columns, residual])
-    w = np.asarray(scanner.whiten(g, stacked))[:, : stacked.shape[1]]
+    w = np.asarray(scanner.cells.whiten(g, stacked))[:, : stacked.shape[1]]
     norm = np.linalg.norm(w[:, :-1], axis=0)
     norm[norm == 0] = 1.0
     solution = np.linalg.lstsq(w[:, :-1] / norm, w[:, -1], rcond=1e-9)[0] / norm

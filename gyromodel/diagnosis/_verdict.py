@@ -283,7 +283,7 @@ def _separation(scanner: Scanner, ranking: Ranking, a: str, b: str) -> float | N
     if first is None or second is None:
         return None
     g = ranking.best_cell(a)
-    w = scanner.whiten(g, jnp.asarray(np.concatenate([ranking.baseline_columns, first, second], axis=1)))
+    w = scanner.cells.whiten(g, jnp.asarray(np.concatenate([ranking.baseline_columns, first, second], axis=1)))
     p = ranking.baseline_columns.shape[1]
     base = w[:, :p] / np.maximum(np.linalg.norm(w[:, :p], axis=0), 1e-300)
     rest = w[:, p:] - base @ np.linalg.lstsq(base, w[:, p:], rcond=1e-10)[0]
@@ -318,7 +318,7 @@ def _remaining(scanner: Scanner, baseline: Estimate, selection: Selection) -> tu
         if rows:
             marks = np.zeros((len(scanner.present), len(rows)))
             marks[rows, np.arange(len(rows))] = 1.0
-        w = scanner.whiten(g, jnp.column_stack([jacobian, jnp.asarray(marks), y]))
+        w = scanner.cells.whiten(g, jnp.column_stack([jacobian, jnp.asarray(marks), y]))
         base = w[:, :-1] / np.maximum(np.linalg.norm(w[:, :-1], axis=0), 1e-300)
         residuals.append(float(np.sum((w[:, -1] - base @ np.linalg.lstsq(base, w[:, -1], rcond=1e-10)[0]) ** 2)))
     named = max(residuals[0] - residuals[1], 0.0)
@@ -335,7 +335,7 @@ def driver_shape(scanner: Scanner, selection: Selection, name: str, unit: str) -
     gain = float(estimate.model.gain())
     y = jnp.where(record.sampling.present, record.signals["output"] - predicted, 0.0) / gain
     g = ranking.best_cell(name)
-    w = scanner.whiten(g, jnp.column_stack([jacobian / gain, jnp.asarray(columns), y]))
+    w = scanner.cells.whiten(g, jnp.column_stack([jacobian / gain, jnp.asarray(columns), y]))
     p = jacobian.shape[1]
     norm = np.maximum(np.linalg.norm(w[:, :-1], axis=0), 1e-300)
     u, s, vt = np.linalg.svd(w[:, :-1] / norm, full_matrices=False)

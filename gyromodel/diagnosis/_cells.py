@@ -1,0 +1,154 @@
+"""What each noise cell remembers between rounds: its filter, and the energies CᵀV⁻¹C of all that is searched in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gyromodel.diagnosis._bank import Bank
+from gyromodel.diagnosis._lines import LineGrid
+from gyromodel.estimate import make_filter, whiten_columns
+from gyromodel.noise import NoiseGrid, NoiseRatios
+from gyromodel.numerics.state_space import (
+    Filter,
+    Sampling,
+    at_rest,
+    step_and_pulse_energy,
+    whiten,
+    whiten_on,
+    whiten_transposed,
+)
+
+COLUMN_STEP = 16
+# Cells filtered side by side, rows whitened at a time, and about as many columns in one Gram matrix of whole blocks:
+# they stay in cache.
+CELLS_TOGETHER, ROWS_TOGETHER, GRAM_COLUMNS = 8, 1024, 24
+# Data are whitened in several cells side by side for at most this many columns: beyond, one alone keeps the processor
+# busy.
+FEW_COLUMNS, FEW_STEP = 12, 4
+
+_energies = jax.jit(step_and_pulse_energy)
+_whiten_rows = jax.jit(whiten_on)
+
+
+@jax.jit
+def precision(filter: Filter, columns):
+    """V⁻¹x."""
+    return whiten_transposed(filter, whiten(filter, columns))
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What one noise cell remembers between rounds."""
+
+    filter: Filter
+    log_determinant: float
+    blocks: dict[int, np.ndarray]
+    step: np.ndarray
+    pulse: np.ndarray
+    line: np.ndarray
+
+
+NO_LINES = np.zeros((0, 2, 2))
+
+
+class Cells:
+    """The noise cells of a grid, each prepared at first use."""
+
+    def __init__(self, sampling: Sampling, grid: NoiseGrid, bank: Bank, lines: LineGrid | None) -> None:
+        self._sampling, self._grid, self._lines = sampling, grid, lines
+        self._columns, self._layout = bank.columns, bank.layout()
+        self._cells: dict[int, Cell] = {}
+        waves = lines.waves(lines.exact) if lines else np.zeros((len(bank.columns), 0))
+        raw = np.concatenate([bank.columns, waves], axis=1)
+        raw = np.pad(raw, ((0, 0), (0, -raw.shape[1] % COLUMN_STEP)))
+        self._raw = [jnp.asarray(raw[i : i + ROWS_TOGETHER]) for i in range(0, len(raw), ROWS_TOGETHER)]
+
+    def sampled(self, sampling: Sampling) -> Cells:
+        """The same cells with other samples missing."""
+        other = copy(self)
+        other._sampling, other._cells = sampling, {}
+        return other
+
+    def __getitem__(self, g: int) -> Cell:
+        """The cell's memory, made at first use."""
+        if g not in self._cells:
+            self.prepare([g], map)
+        return self._cells[g]
+
+    def prepare(self, cells: Sequence[int], each: Callable[..., Iterable]) -> None:
+        """Prepare those cells that are not yet; `each` is `map` or a pool's."""
+        cells = [g for g in cells if g not in self._cells]
+        groups = [cells[i : i + CELLS_TOGETHER] for i in range(0, len(cells), CELLS_TOGETHER)]
+        made = [cell for group in each(self._filters, groups) for cell in group]
+        for g, cell in zip(cells, each(self._with_energies, made), strict=True):
+            self._cells[g] = cell
+
+    def _filters(self, cells: Sequence[int]) -> list[Cell]:
+        """Cells without their candidates' energies."""
+        index = np.resize(cells, CELLS_TOGETHER)
+        ratios = NoiseRatios(*(np.asarray(r)[index] for r in self._grid.ratios))
+        filter = make_filter(ratios, self._grid.interval, self._grid.span, self._sampling)
+        step, pulse = (np.asarray(e) for e in _energies(filter))
+        gain, scale = np.asarray(filter.gain), np.asarray(filter.scale)
+        log_determinant = np.asarray(filter.log_determinant)
+        made = []
+        for i in range(len(cells)):
+            own = filter._replace(gain=jnp.asarray(gain[..., i]), scale=jnp.asarray(scale[..., i]))
+            made.append(Cell(own, float(log_determinant[i]), {}, step[:, i].copy(), pulse[:, i].copy(), NO_LINES))
+        return made
+
+    def _with_energies(self, cell: Cell) -> Cell:
+        """CᵀV⁻¹C of every block and line, a few rows at a time."""
+        filter = Filter(*(np.asarray(part) for part in cell.filter))
+        state = at_rest(cell.filter, self._raw[0].shape[1])
+        blocks = {q: np.zeros((count, q, q)) for q, (_, count, _) in self._layout.items()}
+        first, lines = self._columns.shape[1], len(self._lines.exact) if self._lines else 0
+        waves = np.zeros((3, lines))
+        for i, raw in enumerate(self._raw):
+            here = slice(i * ROWS_TOGETHER, (i + 1) * ROWS_TOGETHER)
+            state, rows = _whiten_rows(state, Filter(*(part[here] for part in filter)), raw)
+            w = np.asarray(rows)
+            for q, (_, count, start) in self._layout.items():
+                together = max(GRAM_COLUMNS // q, 1)
+                for k in range(0, count, together):
+                    part = w[:, start + q * k : start + q * min(k + together, count)]
+                    many = part.shape[1] // q
+                    square = (part.T @ part).reshape(many, q, many, q)
+                    blocks[q][k : k + many] += square[np.arange(many), :, np.arange(many), :]
+            c, s = w[:, first : first + lines], w[:, first + lines : first + 2 * lines]
+            waves += np.stack([np.sum(x * y, axis=0) for x, y in ((c, c), (s, s), (c, s))])
+        return replace(cell, blocks=blocks, line=self._lines.energies(*waves) if self._lines else NO_LINES)
+
+    def whiten(self, g: int, columns: jax.Array) -> np.ndarray:
+        """Columns whitened in one noise cell."""
+        padded = jnp.pad(columns, ((0, 0), (0, -columns.shape[1] % COLUMN_STEP)))
+        return np.asarray(whiten_columns(self[g].filter, padded))[:, : columns.shape[1]]
+
+    @staticmethod
+    def groups(cells: Sequence[int], columns: int) -> list[Sequence[int]]:
+        """Cells as `inner_products` takes them for data of so many columns."""
+        together = CELLS_TOGETHER if columns <= FEW_COLUMNS else 1
+        return [cells[i : i + together] for i in range(0, len(cells), together)]
+
+    def inner_products(self, group: Sequence[int], data: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Per cell of a group, V⁻¹x of the data's columns and its inner products with the candidates' columns."""
+        columns = data.shape[1]
+        step = FEW_STEP if columns <= FEW_COLUMNS else COLUMN_STEP
+        data = np.pad(data, ((0, 0), (0, -columns % step)))
+        if columns > FEW_COLUMNS:
+            z = np.asarray(precision(self[group[0]].filter, data))[:, :columns, None]
+        else:
+            filters = [self[g].filter for g in np.resize(group, CELLS_TOGETHER)]
+            gain, scale = (
+                np.stack([np.asarray(getattr(f, part)) for f in filters], axis=-1) for part in ("gain", "scale")
+            )
+            z = np.asarray(precision(filters[0]._replace(gain=gain, scale=scale), data))[:, :columns, : len(group)]
+        z = np.ascontiguousarray(z.transpose(0, 2, 1))
+        cross = self._columns.T @ z.reshape(len(z), -1)
+        return z.transpose(1, 0, 2), cross.reshape(-1, len(group), columns).transpose(1, 0, 2)
