@@ -144,7 +144,7 @@ class Cells:
         if columns > FEW_COLUMNS:
             z = np.asarray(precision(self[group[0]].filter, data))[:, :columns, None]
         else:
-            filters = [self[g].filter for g in np.resize(group, CELLS_TOGETHER)]
+            filters = [self[g].filter for g in (*group, *[group[0]] * (CELLS_TOGETHER - len(group)))]
             gain, scale = (
                 np.stack([np.asarray(getattr(f, part)) for f in filters], axis=-1) for part in ("gain", "scale")
             )
