@@ -12,7 +12,7 @@ from gyromodel.campaign import Campaign
 from gyromodel.effects.drivers import Bias, BiasDrift
 from gyromodel.effects.scale import ScaleFactor
 from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureCurve
-from gyromodel.estimate import Estimate, EstimateError, _fit, fit, fit_record, two_stage
+from gyromodel.estimate import Estimate, EstimateError, _fit, fit, fit_record, two_stage, with_noise_intervals
 from gyromodel.model import GyroModel, ModelError, draw_noise, model_from_effects, record_span
 from gyromodel.noise import NoiseRatios, markov_sum
 from gyromodel.numerics.least_squares import Solution
@@ -180,9 +180,9 @@ def test_both_solvers_agree_in_any_unit(unit: str, size: float, warm: Record):
 def test_scaling_the_output_scales_the_fit(warm: Record):
     """The noise is estimated here: its ratios, the likelihood's choice of them and the intervals know no unit."""
     model = model_from_effects(["scale_factor", "bias", "bias_temperature"])
-    one = fit_record(warm, model, intervals=True)
+    one = with_noise_intervals(fit_record(warm, model))
     scaled = warm._replace(signals=warm.signals | {"output": 4e9 * warm.signals["output"]})
-    other = fit_record(scaled, model, intervals=True)
+    other = with_noise_intervals(fit_record(scaled, model))
     ratio = np.asarray(other.model.vector() / one.model.vector())
     assert ratio == pytest.approx([4e9, 1.0, 1.0], rel=1e-6)
     assert other.std / one.std == pytest.approx([4e9, 1.0, 1.0], rel=1e-6)

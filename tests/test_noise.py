@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import binom, norm
 
 from gyromodel.campaign import Campaign
-from gyromodel.estimate import fit_record
+from gyromodel.estimate import fit_record, with_noise_intervals
 from gyromodel.model import model_from_effects
 from gyromodel.noise import NoiseRatios, coefficients, markov_sum, noise_grid, restricted_likelihood
 from gyromodel.numerics.state_space import Sampling
@@ -168,7 +168,7 @@ def test_intervals_cover_independently_simulated_noise(rng: np.random.Generator)
     reach: dict[str, list[float]] = defaultdict(list)
     for seed in range(SEEDS):
         law = truth.draw(truth.FAMILY[seed % 4], design(ROWS), rng)
-        estimate = fit_record(with_output(record, law.sample(design(ROWS), rng)), model, intervals=True)
+        estimate = with_noise_intervals(fit_record(with_output(record, law.sample(design(ROWS), rng)), model))
         for name, alpha in ids.items():
             level = law.white if alpha is None else law.fractional.get(alpha, 0.0)
             low, high = estimate.noise_interval[name]
@@ -193,7 +193,7 @@ def test_white_noise_shows_no_other(rng: np.random.Generator):
     shown = 0
     for _ in range(12):
         output = truth.white(ROWS, STEP, N, rng)
-        estimate = fit_record(with_output(record, output), model, intervals=True)
+        estimate = with_noise_intervals(fit_record(with_output(record, output), model))
         low = [estimate.noise_interval[name][0] for name in ("noise_flicker", "noise_random_walk")]
         shown += max(low) > 0
         assert estimate.noise_interval["noise_flicker"][1] < N / np.sqrt(STEP)

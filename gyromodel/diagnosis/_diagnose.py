@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from typing import Literal
 
@@ -19,14 +20,14 @@ from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import Found, NoisePath, Progress, Selection, search, standing
 from gyromodel.diagnosis._variance import growing_noise, noise_level, tails, with_variance
 from gyromodel.diagnosis._verdict import driver_shape, judge, minimum_detectable, testable
-from gyromodel.estimate import Estimate, fit_record
+from gyromodel.estimate import Estimate, EstimateError, fit_record, with_noise_intervals
 from gyromodel.model import GyroModel, record_span
 from gyromodel.noise import NoiseGrid, NoiseRatios, noise_grid
 from gyromodel.signals import Record, read_signals
 from gyromodel.units import convertible, factor, from_internal
 
 # ln of the evidence ratio that no noise in or near the family reaches once in a hundred campaigns.
-SAFE_THRESHOLD = 5.0
+SAFE_THRESHOLD = 4.0
 # Folds search the noise cells within this many nats of the best of the main pass.
 FOLD_NEARBY = 3.0
 
@@ -119,13 +120,12 @@ def diagnose(
     unit = _rate_unit(campaigns[0])
     scale = factor("rad/s", unit)
     ordinary = tuple(hold_out and session.ladder(e)[2] for e in (baseline, selection.estimate))
-    if ordinary[1]:
+    extended = _finished(selection.estimate, ordinary[1])
+    if extended.ordinary:
         findings.append(
             "Parameters weigh all samples alike: that predicts left-out blocks better than the fitted noise's weights "
             "do."
         )
-    final = selection.estimate
-    extended = fit_record(final.record, final.model_as_given(), intervals=True, ordinary=ordinary[1])
     judgement = judge(record, session.scanner, baseline, selection, extended, len(bank.names()), nulls)
     gain = not_measured(unit) if not hold_out else _gain(session, baseline, selection, unit, scale, ordinary, say)
     driver = driver_shape(session.scanner, selection, judgement.driver, unit) if judgement.driver else None
@@ -162,6 +162,14 @@ def diagnose(
         baseline=baseline,
         extended=extended,
     )
+
+
+def _finished(estimate: Estimate, ordinary: bool) -> Estimate:
+    """What is published: the last fit, with ordinary weights where they predict better and determine it too."""
+    if ordinary:
+        with contextlib.suppress(EstimateError):
+            estimate = fit_record(estimate.record, estimate.model_as_given(), ordinary=True)
+    return with_noise_intervals(estimate)
 
 
 def _grid(record: Record, baseline: Estimate) -> NoiseGrid:

@@ -14,6 +14,8 @@ from gyromodel.signals import Record
 # A line's energy is computed exactly at the lowest frequencies, at log-spaced ones to interpolate between, and at the
 # leading peaks of each pass, whose correction holds for their neighbours too.
 LOWEST_LINES, SPACED_LINES, PEAKS, PEAK_WIDTH = 24, 24, 12, 6
+# Lines closer than this many steps of the grid are one line to the record, whose resolution is 1/span.
+RESOLVED = 4
 # Fewer cycles in the record than this are a trend, not a line.
 FEWEST_CYCLES = 1.5
 
@@ -49,6 +51,11 @@ class LineGrid:
         here = slice(self.first, self.first + len(self.frequencies))
         found = np.asarray(scipy.fft.rfft(spread, axis=1))[:, here].T
         return np.real(found), -np.imag(found)
+
+    def unresolved(self, lines: np.ndarray) -> np.ndarray:
+        """Which frequencies the record cannot resolve from any of some lines (Hz)."""
+        near = np.abs(self.frequencies[:, None] - lines) < RESOLVED * (self.frequencies[1] - self.frequencies[0])
+        return np.asarray(near.any(axis=1))
 
     def energies(self, cosine: np.ndarray, sine: np.ndarray, cross: np.ndarray) -> np.ndarray:
         """2×2 energies at every frequency from those of the exact ones, each interpolated between.

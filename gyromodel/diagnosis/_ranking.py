@@ -8,6 +8,7 @@ import numpy as np
 
 from gyromodel.diagnosis._evidence import log_sum
 from gyromodel.diagnosis._scan import CellResult, Scanner
+from gyromodel.effects.drivers import BiasPeriodic
 from gyromodel.estimate import Estimate
 from gyromodel.model import GyroModel
 
@@ -47,6 +48,11 @@ class Ranking:
             return r.log_likelihood + self.log_prior[g] + (r.evidence.get(name, -np.inf) if name else 0.0)
 
         return max(self.results, key=weight)
+
+    @property
+    def slow_noise(self) -> bool:
+        """Whether, with nothing added, the noise would have to be slow."""
+        return self.slow[self.best_cell()]
 
     def best_form(self, name: str) -> tuple[int | tuple[int, ...], float, float]:
         """Form, explained sum and dimension of a candidate where it is best."""
@@ -89,7 +95,9 @@ def rank(
     families = scanner.noise_families() if estimate.noise_given else {}
     wanted = sorted({*cells, *(g for f in families.values() for g in f)})
     everything = dict(known or {})
-    everything |= scanner.run([g for g in wanted if g not in everything], columns, residual, contained)
+    everything |= scanner.run(
+        [g for g in wanted if g not in everything], columns, residual, contained, line_frequencies(estimate.model)
+    )
     results = {g: everything[g] for g in cells}
     prior = scanner.grid.log_prior
     logs = np.array([results[g].log_likelihood + prior[g] for g in cells])
@@ -131,6 +139,11 @@ def cells_of_weight(ranking: Ranking, nats: float) -> list[int]:
         best = max(of.values())
         near |= {g for g, v in of.items() if v > best - nats}
     return sorted(near)
+
+
+def line_frequencies(model: GyroModel) -> np.ndarray:
+    """Frequencies (Hz) of the lines that a model has."""
+    return np.concatenate([np.zeros(0), *(np.ravel(e.frequency) for e in model.effects if isinstance(e, BiasPeriodic))])
 
 
 def skipped(model: GyroModel) -> set[str]:

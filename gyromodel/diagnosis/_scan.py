@@ -31,6 +31,7 @@ VANISHED = 1e-6
 THREADS = 2
 # Lines whose interpolated statistic, were it this much larger, would not pay for the search are left interpolated.
 PEAK_SLACK = 1.5
+NO_LINES = np.zeros(0)
 # Records this short are test points, each of which may be anomalous; longer ones are series with single gross errors.
 TEST_POINTS = 40
 
@@ -84,7 +85,8 @@ class Scanner:
     ) -> None:
         self.record, self.bank, self.grid = record, bank, grid
         self.present = np.asarray(record.sampling.present)
-        single = int(np.asarray(record.sampling.restart).sum()) == 1
+        self.runs = int(np.asarray(record.sampling.restart).sum())
+        single = self.runs == 1
         self.steps = single and "bias_step" in bank.scans
         self.lines = line_grid(record) if single and "bias_periodic" in bank.scans and record.rows >= 16 else None
         self.outliers = outliers
@@ -147,7 +149,12 @@ class Scanner:
         ]
 
     def run(
-        self, cells: Sequence[int], jacobian: np.ndarray, residual: np.ndarray, contained: dict[str, int]
+        self,
+        cells: Sequence[int],
+        jacobian: np.ndarray,
+        residual: np.ndarray,
+        contained: dict[str, int],
+        lines: np.ndarray = NO_LINES,
     ) -> dict[int, CellResult]:
         """Evaluate every candidate against a baseline in the given noise cells.
 
@@ -156,12 +163,18 @@ class Scanner:
             jacobian: the baseline's columns, any scale.
             residual: measured minus predicted, as a rate.
             contained: how many of a candidate's columns the baseline already has, by name.
+            lines: frequencies (Hz) of the baseline's lines.
         """
-        batches = self.run_many(cells, jacobian, residual[:, None], contained)
+        batches = self.run_many(cells, jacobian, residual[:, None], contained, lines)
         return {g: batch.first() for g, batch in zip(cells, batches, strict=True)}
 
     def run_many(
-        self, cells: Sequence[int], jacobian: np.ndarray, residuals: np.ndarray, contained: dict[str, int]
+        self,
+        cells: Sequence[int],
+        jacobian: np.ndarray,
+        residuals: np.ndarray,
+        contained: dict[str, int],
+        lines: np.ndarray = NO_LINES,
     ) -> list[Batch]:
         """As `run`, for many residuals of one baseline at once (one a column); cells in the order given."""
         spare = np.array([contained.get(b.name, 0) for b in self.bank.blocks])
@@ -169,10 +182,12 @@ class Scanner:
         least = np.where(drivers, 1, np.maximum(self._widths - spare, 1))
         stacked = np.where(self.present[:, None], np.column_stack([jacobian, residuals]), 0.0)
         p = jacobian.shape[1]
+        # What follows a line closely is a line that is not steady, and no other line.
+        barred = self.lines.unresolved(lines) if self.lines else np.zeros(0, bool)
 
         def search(group: Sequence[int]) -> list[Batch]:
             z, cross = self.cells.inner_products(group, stacked)
-            return [self._run_cell(g, stacked, z[i], cross[i], p, least) for i, g in enumerate(group)]
+            return [self._run_cell(g, stacked, z[i], cross[i], p, least, barred) for i, g in enumerate(group)]
 
         # Cells share the cores; BLAS threads on top of them would only wait for one another.
         with _libraries().limit(limits=1, user_api="blas"), ThreadPoolExecutor(THREADS) as pool:
@@ -185,7 +200,9 @@ class Scanner:
         """Samples present."""
         return int(self.present.sum())
 
-    def _run_cell(self, g: int, x: np.ndarray, z: np.ndarray, cross: np.ndarray, p: int, least: np.ndarray) -> Batch:
+    def _run_cell(
+        self, g: int, x: np.ndarray, z: np.ndarray, cross: np.ndarray, p: int, least: np.ndarray, barred: np.ndarray
+    ) -> Batch:
         cell = self.cells[g]
         against = x[:, :p].T @ z
         norm = np.sqrt(np.maximum(np.diag(against)[:p], 1e-300))
@@ -211,7 +228,7 @@ class Scanner:
             else:
                 self._single(batch, "outliers", rows, zy[rows], cell.pulse[rows], zj[rows], nu)
         if self.lines:
-            self._lines(batch, g, zj, zy, nu)
+            self._lines(batch, g, zj, zy, nu, barred)
         return batch
 
     def _blocks(
@@ -276,7 +293,7 @@ class Scanner:
         batch.best["outliers"] = (sets, np.array(explained), np.array(dimension))
         batch.energy["outliers"] = np.diag(left)
 
-    def _lines(self, batch: Batch, g: int, zj: np.ndarray, zy: np.ndarray, nu: int) -> None:
+    def _lines(self, batch: Batch, g: int, zj: np.ndarray, zy: np.ndarray, nu: int, barred: np.ndarray) -> None:
         assert self.lines is not None
         cell = self.cells[g]
         p = zj.shape[1]
@@ -285,7 +302,7 @@ class Scanner:
         a22 = cell.line[:, 1, 1] - np.sum(s[:, :p] ** 2, axis=1)
         a12 = cell.line[:, 0, 1] - np.sum(c[:, :p] * s[:, :p], axis=1)
         determinant = a11 * a22 - a12**2
-        keep = (determinant > 1e-3 * cell.line[:, 0, 0] * cell.line[:, 1, 1]) & (a11 > 0)
+        keep = (determinant > 1e-3 * cell.line[:, 0, 0] * cell.line[:, 1, 1]) & (a11 > 0) & ~barred
         weight = np.where(keep, 1.0 / np.where(keep, determinant, 1.0), 0.0)[:, None]
         bc, bs = c[:, p:], s[:, p:]
         t = weight * (a22[:, None] * bc**2 - 2 * a12[:, None] * bc * bs + a11[:, None] * bs**2)

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from gyromodel.diagnosis._evidence import log_evidence_ratio, log_sum
-from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise, rank_where_it_matters
+from gyromodel.diagnosis._lines import RESOLVED
+from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise, line_frequencies, rank_where_it_matters
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.effects import Effect
 from gyromodel.effects.drivers import BiasPeriodic, BiasStep
@@ -36,6 +37,8 @@ LINE_LEAD = 20.0
 # beside it.
 SLOW_IN_TIME = ("bias_drift", "bias_warmup", "bias_step")
 SLOW_LEAD = 2.5
+# A function of time alone must beat a random walk by this much in one run: no real slow noise is exactly a random walk.
+TIME_MARGIN = 15.0
 
 
 @dataclass(frozen=True)
@@ -129,9 +132,15 @@ def search(
     found, left_out = standing(path), {}
     if sum(f.effect is not None for f in found) > 1:
         found, estimates[-1], left_out = _exchange(record, scanner, baseline, found, estimates[-1], threshold, noise)
-    driver, score = ranking.best(drivers=True)
-    driver = driver if score >= threshold else None
+    driver = _significant_driver(ranking, threshold, scanner.runs)
     return Selection(estimates[-1], tuple(found), tuple(path), ranking, tuple(estimates), driver, left_out, remains)
+
+
+def _significant_driver(ranking: Ranking, threshold: float, runs: int) -> str | None:
+    """The leading smooth driver, if it is significant; for one of time beside slow noise, over what a walk makes."""
+    driver, score = ranking.best(drivers=True)
+    like_a_walk = driver == "smooth(time)" and runs < 2 and ranking.slow_noise
+    return driver if score >= (max(threshold, TIME_MARGIN) if like_a_walk else threshold) else None
 
 
 def _before(i: int, path: list[Found], estimates: list[Estimate]) -> Selection:
@@ -169,11 +178,6 @@ def _slow_structure(ranking: Ranking, name: str, score: float, threshold: float)
     return bool(still) and log_sum(logs + each) - log_sum(logs) > threshold
 
 
-def line_frequencies(model: GyroModel) -> np.ndarray:
-    """Frequencies (Hz) of the lines that a model has."""
-    return np.concatenate([np.zeros(0), *(np.ravel(e.frequency) for e in model.effects if isinstance(e, BiasPeriodic))])
-
-
 def _addition(scanner: Scanner, estimate: Estimate, ranking: Ranking, name: str, pulses: tuple[int, ...]) -> Found:
     """A named candidate as an effect at its best form, as rows given up, or as noise that is not stated."""
     if is_noise(name):
@@ -201,9 +205,11 @@ def _lines(scanner: Scanner, ranking: Ranking, model: GyroModel) -> np.ndarray:
     chosen = {form: explained}
     count, nu = len(scanner.lines.frequencies), scanner.degrees_of_freedom
     for k, t in sorted(result.peaks.items(), key=lambda item: -item[1]):
+        if min(abs(k - j) for j in chosen) < RESOLVED:
+            continue
         # A line leaks as the square of 1/(π × its distance in steps of the record's resolution, a quarter of which
         # is the grid's).
-        leakage = sum(other / (0.25 * np.pi * max(abs(k - j), 1e-3)) ** 2 for j, other in chosen.items())
+        leakage = sum(other / (0.25 * np.pi * abs(k - j)) ** 2 for j, other in chosen.items())
         alone = float(log_evidence_ratio(np.array(t), result.rss, nu, 2)) - np.log(count)
         if alone > LINE_MARGIN and t > ABOVE_LEAKAGE * leakage:
             chosen[k] = t

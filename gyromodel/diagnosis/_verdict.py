@@ -13,7 +13,15 @@ from gyromodel.diagnosis._evidence import explained_for
 from gyromodel.diagnosis._ranking import Ranking, is_driver
 from gyromodel.diagnosis._result import Cause, Confuser, Driver, ParameterValue, Verdict
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._search import SLOW_IN_TIME, Found, Selection, form_effect, leave_one_out, uncontested
+from gyromodel.diagnosis._search import (
+    SLOW_IN_TIME,
+    TIME_MARGIN,
+    Found,
+    Selection,
+    form_effect,
+    leave_one_out,
+    uncontested,
+)
 from gyromodel.effects import Effect
 from gyromodel.estimate import Estimate
 from gyromodel.model import effect_class, parameter_unit
@@ -22,8 +30,6 @@ from gyromodel.units import factor, from_internal, internal_unit
 
 # Share of the posterior that the credible set holds.
 CREDIBLE = 0.95
-# A function of time alone must beat a random walk by this much in one run: no real slow noise is exactly a random walk.
-TIME_MARGIN = 15.0
 # Where the noise has a random walk even with them, these have no edge that a walk could not make, whatever their lead.
 NO_EDGE = ("bias_drift", "bias_warmup")
 # A driver that names leave with more than this share of the structure makes the discrepancy unknown.
@@ -53,7 +59,7 @@ def credible(
     apart = beside | (set() if name == "outliers" else {"outliers"})
     own = {k: v for k, v in ranking.statistic.items() if not is_driver(k) and (k == name or k not in apart)}
     hidden_by_walk = name in NO_EDGE and ranking.walks[ranking.best_cell(name)]
-    too_close = name in SLOW_IN_TIME and statistic < TIME_MARGIN and _coloured(ranking)
+    too_close = name in SLOW_IN_TIME and statistic < TIME_MARGIN and ranking.slow_noise
     if runs < 2 and (hidden_by_walk or too_close):
         own["noise_random_walk"] = max(0.0, statistic - 1.0)
     top = max(own.values())
@@ -79,12 +85,6 @@ def _supersedes(name: str) -> tuple[str, ...]:
     return effect_class(name).supersedes
 
 
-def _coloured(ranking: Ranking) -> bool:
-    """Whether, with nothing added, the noise would have to be slow."""
-    g = ranking.best_cell()
-    return ranking.slow[g]
-
-
 def judge(
     record: Record,
     scanner: Scanner,
@@ -96,7 +96,7 @@ def judge(
 ) -> Judgement:
     """The verdict on a finished search."""
     found = list(selection.found)
-    runs = int(np.asarray(record.sampling.restart).sum())
+    runs = scanner.runs
     causes, sets, findings = [], [], []
     for i, step in enumerate(found):
         ranking = selection.left_out.get(i) or step.ranking

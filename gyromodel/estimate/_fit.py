@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import Literal
 
 import jax
@@ -53,7 +54,7 @@ def fit(
     record = read_signals(campaigns)
     if progress:
         progress("fitting", 0.1)
-    estimate = fit_record(record, model, solver=solver, intervals=True)
+    estimate = with_noise_intervals(fit_record(record, model, solver=solver))
     if progress:
         progress("fitted", 1.0)
     return estimate
@@ -65,7 +66,6 @@ def fit_record(
     *,
     ratios: NoiseRatios | None = None,
     solver: Solver = "levenberg_marquardt",
-    intervals: bool = False,
     ordinary: bool = False,
 ) -> Estimate:
     """As `fit`, on signals already read.
@@ -75,7 +75,6 @@ def fit_record(
         model: what to fit.
         ratios: noise ratios to hold instead of estimating them.
         solver: see `fit`.
-        intervals: whether to find the noise coefficients' intervals.
         ordinary: weigh all samples alike in the parameters (the noise is still estimated, and so is the covariance that
             ordinary least squares has under it): less efficient where the noise model is right, safer where it is not.
     """
@@ -107,7 +106,7 @@ def fit_record(
             f"the fit of {', '.join(model.labels)} did not converge in {solution.iterations} iterations: "
             "give start values near the solution, or fix some parameters"
         )
-    return _finish(record, model.with_vector(jnp.asarray(solution.x)), ratios, filter, solution, intervals, ordinary)
+    return _finish(record, model.with_vector(jnp.asarray(solution.x)), ratios, filter, solution, ordinary)
 
 
 def check_covariates(record: Record, model: GyroModel) -> None:
@@ -226,7 +225,6 @@ def _finish(
     ratios: NoiseRatios,
     filter: Filter,
     solution: Solution,
-    intervals: bool,
     ordinary: bool,
 ) -> Estimate:
     predicted, jacobian = model.linearise(record.signals)
@@ -242,10 +240,7 @@ def _finish(
     nu = len(w) - p
     variance = float(w[:, p] @ w[:, p]) / nu
     likelihood = from_grams(np.atleast_1d(filter.log_determinant), (w.T @ w)[None], len(w)).log_likelihood[0]
-    args = (record.interval, record_span(record), record.sampling, jacobian, residual)
-    gain = float(model.gain())
-    noise = dict(model.noise) or noise_coefficients(ratios, variance, record, gain)
-    spans = _noise_intervals(args, ratios, record, gain) if intervals and not model.noise else {}
+    noise = dict(model.noise) or noise_coefficients(ratios, variance, record, float(model.gain()))
     rows = record.rows
     whitened = np.full(rows, np.nan)
     whitened[record.present] = w[:, p] / np.sqrt(variance)
@@ -262,7 +257,6 @@ def _finish(
         record=record,
         noise_given=bool(model.noise),
         ordinary=ordinary,
-        noise_interval=spans,
     )
 
 
@@ -311,12 +305,23 @@ def _coloured_transposed(filter: Filter, columns):
     return jax.vmap(lambda c: transposed(c)[0], in_axes=1, out_axes=1)(columns)
 
 
-def _noise_intervals(args, best: NoiseRatios, record: Record, gain: float) -> dict[str, tuple[float, float]]:
-    """95 % intervals of the noise coefficients: their ranges over the cells that a likelihood ratio does not reject."""
-    grid = noise_grid(int(record.present.sum()), record.interval, record_span(record)).ratios
-    cells = _mesh(np.union1d(r, float(b) * np.array([0.2, 1.0, 5.0])) for r, b in zip(grid, best, strict=True))
+def with_noise_intervals(estimate: Estimate) -> Estimate:
+    """The estimate with 95 % intervals of its noise coefficients, where the noise was estimated.
+
+    They are the coefficients' ranges over the noise cells that a likelihood ratio does not reject.
+    """
+    if estimate.noise_given:
+        return estimate
+    record, gain = estimate.record, float(estimate.model.gain())
+    predicted, jacobian = estimate.model.linearise(record.signals)
+    residual = jnp.where(record.sampling.present, record.signals["output"] - predicted, 0.0)
+    span = record_span(record)
+    grid = noise_grid(int(record.present.sum()), record.interval, span).ratios
+    cells = _mesh(
+        np.union1d(r, float(b) * np.array([0.2, 1.0, 5.0])) for r, b in zip(grid, estimate.ratios, strict=True)
+    )
     for margin in (4.0, 2.0, 2.0, 2.0, 0.0):
-        result = restricted_likelihood(cells, *args)
+        result = restricted_likelihood(cells, record.interval, span, record.sampling, jacobian, residual)
         below = result.log_likelihood.max() - result.log_likelihood
         kept = below < REJECTED
         if not margin or kept.sum() > 2 * INTERVAL_LEVELS:
@@ -328,7 +333,7 @@ def _noise_intervals(args, best: NoiseRatios, record: Record, gain: float) -> di
     low, high = spans["noise_white"]
     scatter = 1.96 / float(np.sqrt(2 * (record.present.sum() - 1)))
     spans["noise_white"] = (low * (1 - scatter), high * (1 + scatter))
-    return spans
+    return replace(estimate, noise_interval=spans)
 
 
 def _levels(ratio: np.ndarray, likely: np.ndarray) -> np.ndarray:
