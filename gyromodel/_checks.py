@@ -11,6 +11,8 @@ import numpy as np
 
 from gyromodel import units as unit_system
 
+# Signals that models see besides the columns.
+DERIVED = ("time_on", "temperature_rate")
 KINDS = ("rate", "increment", "angle")
 MAX_METADATA = 10_000
 
@@ -33,7 +35,7 @@ _EXPECTED = tuple(
 )
 # Raw counts say nothing about the kind, and neither does an analogue voltage.
 _OUTPUT_UNITS = {
-    "rate": ["deg/s", "deg/h", "rad/s", "count", "bit", "V", "count/s", "bit/s", "A", "Hz"],
+    "rate": ["deg/s", "deg/h", "rad/s", "count", "bit", "V", "count/s", "bit/s", "V/s", "A", "Hz"],
     "increment": ["arcsec", "deg", "rad", "count", "bit", "V"],
     "angle": ["deg", "rad", "count", "bit", "V"],
 }
@@ -56,6 +58,8 @@ def check_unit(name: str, unit: str | None) -> str:
     if not _COLUMN_NAME.fullmatch(name) or len(name.encode()) > 200:
         rule = 'it must start with a letter or digit, have at most 200 bytes and none of [ ] , ; " / \\'
         raise CampaignError(f"{shown(name)} cannot name a column: {rule}")
+    if name in DERIVED:
+        raise CampaignError(f"column '{name}' has the name of a signal that is derived from others: rename it")
     known = next(((meaning, examples) for pattern, meaning, examples in _EXPECTED if pattern.fullmatch(name)), None)
     if unit is None:
         accepted = f"{known[0]}: {listed(known[1])}" if known else unit_system.ACCEPTED

@@ -165,6 +165,8 @@ def diagnose(
 
     Writes the extended model, the gain measured on data it did not see, and a report.
     """
+    if 0 < calibrate < 200:
+        raise typer.BadParameter("200 campaigns or more show a 99 % point; 0 takes the safe threshold", param_hint="N")
     result, verdict = _diagnose(campaigns, model, output, axis=axis, calibrate=calibrate, seed=seed)
     if as_json:
         print(_json(result), end="")

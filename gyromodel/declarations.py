@@ -98,3 +98,8 @@ def _parameters(node: ast.ClassDef) -> dict[str, ParameterDeclaration]:
             linear = next((ast.literal_eval(k.value) for k in value.keywords if k.arg == "linear"), True)
             found[name] = ParameterDeclaration(name, unit, float(typical), meaning, linear)
     return found
+
+
+def column_of(label: str) -> str:
+    """The column that a linear driver's id names: bias_<column>, or bias_column_<column>."""
+    return label.removeprefix("bias_").removeprefix("column_")

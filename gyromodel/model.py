@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from difflib import get_close_matches
 from typing import NamedTuple
 
 import equinox as eqx
@@ -12,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from gyromodel.campaign import Campaign
+from gyromodel.declarations import column_of
 from gyromodel.effects import CATALOGUE, Effect, Signals
 from gyromodel.effects._base import evaluate
 from gyromodel.effects.drivers import BiasColumn
@@ -63,9 +65,19 @@ class GyroModel(eqx.Module):
         return tuple(e.label for e in self.effects)
 
     def with_effect(self, effect: Effect) -> GyroModel:
-        """The model extended by one effect, which replaces any that it contains as a special case."""
-        kept = tuple(e for e in self.effects if e.label not in effect.supersedes)
-        return GyroModel((*kept, effect), self.noise, self.fixed, self.gyro)
+        """The model extended by one effect, which replaces any that it contains as a special case.
+
+        An effect of its own label gives way, and is free from then on, if all its parameters were fixed.
+        """
+        replaced = {*effect.supersedes, *({effect.label} & self.wholly_fixed())}
+        kept = tuple(e for e in self.effects if e.label not in replaced)
+        fixed = frozenset(key for key in self.fixed if key[0] not in replaced)
+        return GyroModel((*kept, effect), self.noise, fixed, self.gyro)
+
+    def wholly_fixed(self) -> set[str]:
+        """Labels of the effects none of whose parameters is free."""
+        free = {self.effects[slot.effect].label for slot in self.slots()}
+        return set(self.labels) - free
 
     def without(self, label: str) -> GyroModel:
         """The model less one effect (the last of that label)."""
@@ -79,7 +91,9 @@ class GyroModel(eqx.Module):
         for effect in self.effects:
             for name in effect.columns_needed:
                 if name not in signals:
-                    raise ModelError(f"effect {effect.label} needs a column {name}, which the campaign lacks")
+                    close = get_close_matches(effect.label, CATALOGUE, n=1) if isinstance(effect, BiasColumn) else []
+                    hint = f"; did you mean {close[0]}?" if close else ""
+                    raise ModelError(f"effect {effect.label} needs a column {name}, which the campaign lacks{hint}")
 
     def prepared(self, signals: Signals) -> GyroModel:
         """Reference points and start values that depend on the campaign filled in."""
@@ -191,7 +205,7 @@ def effect_class(label: str) -> type[Effect]:
 def make_effect(label: str) -> Effect:
     """A catalogue effect at its default values."""
     kind = effect_class(label)
-    return kind(column=label.removeprefix("bias_")) if kind is BiasColumn else kind()  # type: ignore[call-arg]
+    return kind(column=column_of(label)) if kind is BiasColumn else kind()  # type: ignore[call-arg]
 
 
 def model_from_effects(labels: Iterable[str], gyro: str = "") -> GyroModel:
@@ -217,6 +231,8 @@ def check_units(model: GyroModel, output_unit: str, units: Mapping[str, str]) ->
 
     Counts may leave out "per second", in the output as in the scale factor: count/deg and count/(deg/s) mean the same.
     """
+    if output_unit != "rad/s" and not any(e.site == "gain" for e in model.effects):
+        raise ModelError(f"the output is in [{output_unit}], which is no angular rate: the model needs a scale_factor")
     for effect in model.effects:
         written = getattr(effect, "unit", "")
         if not written:
@@ -242,7 +258,7 @@ def simulate(model: GyroModel, campaign: Campaign, seed: int = 0) -> Campaign:
     Raises:
         ModelError: the model misses a value, a column or its noise.
     """
-    if "output" not in campaign.columns:
+    if not campaign.outputs:
         campaign = campaign.with_column("output", np.arange(len(campaign), dtype=float), "deg/s")
     record = read_signals(campaign)
     unset = [e.label for e in model.effects if not np.isfinite(np.asarray(e.linear())).all()]

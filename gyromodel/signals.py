@@ -16,7 +16,7 @@ from gyromodel._checks import CampaignError
 from gyromodel.campaign import Campaign
 from gyromodel.numerics.smoothing import smooth_derivative
 from gyromodel.numerics.state_space import Sampling
-from gyromodel.units import internal_unit
+from gyromodel.units import convertible, internal_unit
 
 # A step this many times the median one separates stretches of a record.
 GAP = 10.0
@@ -24,6 +24,10 @@ GAP = 10.0
 FINER_FROM = 4096
 # A step this many times the median one leaves out samples.
 INCREMENT_GAP = 1.5
+# A clock is regular if most steps differ by less than this part of the median one; the others are gaps.
+IRREGULAR, MOST_REGULAR = 0.01, 0.9
+# A column missing in more than this share of the rows is not searched; rows without one of the others are left out.
+MOST_MISSING = 0.2
 
 
 class Record(NamedTuple):
@@ -74,9 +78,12 @@ def rate_output(campaign: Campaign) -> tuple[np.ndarray, str]:
     if kind == "angle":
         output = np.diff(output, prepend=np.nan)
     interval = np.diff(campaign.si("time"), prepend=np.nan)
-    interval[0] = np.median(interval[1:])
+    typical = np.median(interval[1:])
+    # How long the first increment took is known only from a regular clock.
+    if np.mean(np.abs(interval[1:] - typical) < IRREGULAR * typical) > MOST_REGULAR:
+        interval[0] = typical
     # What was turned through during a gap is not known: the first increment behind one is missing.
-    return np.where(interval > INCREMENT_GAP * interval[0], np.nan, output / interval), f"{unit}/s"
+    return np.where(interval > INCREMENT_GAP * typical, np.nan, output / interval), f"{unit}/s"
 
 
 def _stretches(time: np.ndarray) -> np.ndarray:
@@ -109,6 +116,7 @@ def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
     campaigns = [campaigns] if isinstance(campaigns, Campaign) else list(campaigns)
     names = ["time", *campaigns[0].covariates]
     for other in campaigns[1:]:
+        _check_alike(campaigns[0], other)
         missing = set(names) ^ {"time", *other.covariates}
         if missing:
             raise CampaignError(
@@ -118,21 +126,15 @@ def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
     blocks, schemes, unit = [], set(), ""
     for campaign in campaigns:
         time = campaign.si("time")
-        output, this_unit = rate_output(campaign)
-        if unit and this_unit != unit:
-            raise CampaignError(f"{campaign.name}: output unit {this_unit} differs from {unit} of the first campaign")
-        unit = this_unit
+        output, unit = rate_output(campaign)
         columns = {n: campaign.si(n) for n in names}
         columns["time"] = time - time[0]
         columns["time_on"] = columns["time"] + _power_on(campaign)
         if "temperature" in columns:
             stretch = _stretches(time)
-            columns["temperature_rate"] = np.concatenate(
-                [
-                    _thermometer_rate(time[stretch == s], columns["temperature"][stretch == s])
-                    for s in np.unique(stretch)
-                ]
-            )
+            columns["temperature_rate"] = _thermometer_rate(time, columns["temperature"], stretch)
+        if len(campaigns) > 1 and "campaign" not in names:
+            columns["campaign"] = np.full(len(time), 1.0 + len(blocks))
         columns["output"] = output
         step = np.diff(time, prepend=time[0])
         columns["_interval"], columns["_restart"] = step, np.arange(len(time)) == 0
@@ -142,9 +144,25 @@ def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
         blocks.append(block + (blocks[-1].max() + 1 if blocks else 0))
         schemes.add(scheme)
     signals = {n: np.concatenate(v) for n, v in parts.items()}
-    units = {n: campaigns[0].units[n] for n in names}
+    units = {"campaign": ""} | {n: campaigns[0].units[n] for n in names}
     record = _pad(signals, np.concatenate(blocks), " and ".join(sorted(schemes)), unit, units)
     return record._replace(data_hash="+".join(c.digest() for c in campaigns))
+
+
+def _check_alike(first: Campaign, other: Campaign) -> None:
+    """Refuse campaigns that are not of one unit, recorded alike."""
+    for key in ("kind", "serial", "rate_frame"):
+        a, b = first.metadata.get(key), other.metadata.get(key)
+        if a is not None and b is not None and a != b:
+            raise CampaignError(f"{other.name}: campaigns fitted together need the same {key}, but it is {b} after {a}")
+    for name in set(first.columns) & set(other.columns):
+        if not convertible(other.units[name], first.units[name]):
+            raise CampaignError(
+                f"{other.name}: column '{name}' is in [{other.units[name]}], but in [{first.units[name]}] in the first "
+                "campaign"
+            )
+    if first.equals(other):
+        raise CampaignError(f"{other.name}: the same data were given twice")
 
 
 def _power_on(campaign: Campaign) -> float:
@@ -155,13 +173,40 @@ def _power_on(campaign: Campaign) -> float:
     return float(value)
 
 
-def _thermometer_rate(time: np.ndarray, temperature: np.ndarray) -> np.ndarray:
+def _thermometer_rate(time: np.ndarray, temperature: np.ndarray, stretch: np.ndarray) -> np.ndarray:
+    """dT/dt of the smoothed thermometer, each stretch by itself; a sample alone takes the slope to its neighbours."""
     good = np.isfinite(temperature)
-    if good.sum() < 2:
-        return np.full(len(time), np.nan)
     rate = np.full(len(time), np.nan)
-    rate[good] = smooth_derivative(time[good], temperature[good])
+    if good.sum() < 2:
+        return rate
+    rate[good] = np.gradient(temperature[good], time[good])
+    for s in np.unique(stretch):
+        here = good & (stretch == s)
+        if here.sum() > 1:
+            rate[here] = smooth_derivative(time[here], temperature[here])
     return rate
+
+
+def with_columns_known(record: Record) -> tuple[Record, list[str]]:
+    """The record without the rows where a measured column is missing, and a sentence for each such column.
+
+    A column missing in more than a fifth of the rows is left as it is: it costs more than it can tell.
+    """
+    signals, said = dict(record.signals), []
+    present, row = record.present, np.arange(len(signals["time"]))
+    for name in [n for n in signals if n != "output"]:
+        values = np.array(signals[name])
+        bad = ~np.isfinite(values)
+        lost = int((bad[: record.rows] & present).sum())
+        if not bad.any() or lost > MOST_MISSING * present.sum():
+            continue
+        # Rows that are left out still need a finite value, which then has no weight.
+        values[bad] = np.interp(row[bad], row[~bad], values[~bad])
+        signals[name] = jnp.asarray(values)
+        record = record.without(np.flatnonzero(bad[: record.rows]))
+        if lost and name in record.units:
+            said.append(f"{lost} rows without {name} were left out.")
+    return record._replace(signals=signals), said
 
 
 def _pad(columns: dict[str, np.ndarray], blocks: np.ndarray, scheme: str, unit: str, units: dict[str, str]) -> Record:

@@ -5,13 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from gyromodel.campaign import Campaign
-from gyromodel.signals import GAP
+from gyromodel.signals import GAP, rate_output
+from gyromodel.units import from_internal
 
 MAXIMUM_ROWS = 20_000
 
 
 def average(campaign: Campaign, maximum: int = MAXIMUM_ROWS) -> tuple[Campaign, int]:
     """Means of consecutive samples, never across a gap or a change of segment, run or position.
+
+    Increments and angles become rates, so that a mean is one whatever its samples' spacing. Where a stretch ends, a
+    last group of less than half the samples is dropped, unless it is all of the stretch.
 
     Returns:
         The shorter campaign and how many samples went into each mean (1: unchanged).
@@ -20,6 +24,8 @@ def average(campaign: Campaign, maximum: int = MAXIMUM_ROWS) -> tuple[Campaign, 
     together = -(-rows // maximum)
     if together == 1:
         return campaign, 1
+    if campaign.metadata["kind"] != "rate":
+        campaign = _as_rate(campaign)
     time = campaign.columns["time"]
     step = np.diff(time)
     breaks = np.concatenate([[False], step > GAP * np.median(step)])
@@ -31,16 +37,21 @@ def average(campaign: Campaign, maximum: int = MAXIMUM_ROWS) -> tuple[Campaign, 
     within = np.arange(rows) - first[stretch]
     starts = np.flatnonzero(within % together == 0)
     counts = np.diff(np.append(starts, rows))
-    starts, counts = starts[counts == together], counts[counts == together]
-    index = starts[:, None] + np.arange(together)
+    kept = (2 * counts >= together) | (within[starts] == 0)
     columns = {}
     for name, values in campaign.columns.items():
-        group = values[index]
-        seen = np.isfinite(group).sum(1)
-        mean = np.where(seen > 0, np.nansum(group, axis=1) / np.maximum(seen, 1), np.nan)
-        if name.startswith("output") and campaign.metadata["kind"] == "increment":
-            mean = mean * together
-        if name.startswith("output") and campaign.metadata["kind"] == "angle":
-            mean = group[:, -1]
-        columns[name] = mean
+        seen = np.isfinite(values)
+        total, count = (np.add.reduceat(x, starts)[kept] for x in (np.where(seen, values, 0.0), seen.astype(float)))
+        columns[name] = np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
     return Campaign(columns, campaign.units, campaign.metadata, campaign.name), together
+
+
+def _as_rate(campaign: Campaign) -> Campaign:
+    unit = f"{campaign.units['output']}/s"
+    output = from_internal(rate_output(campaign)[0], unit)
+    return Campaign(
+        {**campaign.columns, "output": output},
+        {**campaign.units, "output": unit},
+        {**campaign.metadata, "kind": "rate"},
+        campaign.name,
+    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -17,6 +16,8 @@ from gyromodel.signals import Record
 SMOOTH_SCALES = (0.08, 0.2, 0.5)
 PAIR_SCALES = (0.25, 0.6)
 DERIVED = ("time", "time_on", "output", "temperature_rate")
+# Columns whose linear effect on the bias is in the catalogue, is the scale factor, or means nothing.
+OWN_EFFECTS = ("rate", "temperature", "campaign")
 NOT_DRIVERS = ("segment", "run", "position")
 
 
@@ -56,16 +57,11 @@ class Bank:
 
 def driver_names(record: Record) -> tuple[str, ...]:
     """Measured columns that vary: what an unknown discrepancy may follow, besides time."""
-    names = []
-    for name, values in record.signals.items():
-        v = np.asarray(values)[: record.rows]
-        if name not in DERIVED + NOT_DRIVERS and np.isfinite(v).all() and np.ptp(v) > 0:
-            names.append(name)
-    return tuple(names)
+    return tuple(n for n in record.signals if n not in DERIVED + NOT_DRIVERS and not _unusable(record, n))
 
 
-def build_bank(record: Record, included: Iterable[str] = ()) -> Bank:
-    """Lay out the search for a record; `included` effects are searched too, so that the bank serves every round."""
+def build_bank(record: Record) -> Bank:
+    """Lay out the search for a record."""
     signals = record.signals
     blocks: list[tuple[str, Literal["effect", "driver"], np.ndarray, Effect | None]] = []
     not_testable: dict[str, str] = {}
@@ -79,6 +75,8 @@ def build_bank(record: Record, included: Iterable[str] = ()) -> Bank:
         reason = _missing(kind, record)
         if reason:
             not_testable[name] = reason
+        elif kind.scan and np.asarray(record.sampling.restart).sum() > 1:
+            not_testable[name] = "is searched in one run at a time: diagnose the runs one by one too"
         elif kind.scan:
             scans.append(name)
         else:
@@ -86,7 +84,13 @@ def build_bank(record: Record, included: Iterable[str] = ()) -> Bank:
             if not forms:
                 not_testable[name] = "its driver does not vary"
             blocks.extend((name, "effect", _weighted(e, signals, rate), e) for e in forms)
-    plain = [n for n in driver_names(record) if n not in ("rate", "temperature")]
+    plain = [n for n in driver_names(record) if n not in OWN_EFFECTS]
+    for name in record.signals:
+        reason = "" if name in DERIVED + NOT_DRIVERS else _unusable(record, name)
+        if reason:
+            not_testable |= {f"smooth({name})": reason} | (
+                {} if name in OWN_EFFECTS else {BiasColumn(column=name).label: reason}
+            )
     for name in plain:
         effect = BiasColumn(column=name).prepared(signals)
         blocks.append((effect.label, "effect", _weighted(effect, signals, rate), effect))
@@ -112,11 +116,18 @@ def _missing(kind: type[Effect], record: Record) -> str:
     for name in kind.needs:
         if name not in record.signals:
             return f"needs a column {name}"
-        if not np.isfinite(np.asarray(record.signals[name])[: record.rows]).all():
-            return f"column {name} has missing values"
-        if np.ptp(np.asarray(record.signals[name])[: record.rows]) == 0:
-            return f"{name} does not vary"
+        if reason := _unusable(record, name):
+            return reason
     return ""
+
+
+def _unusable(record: Record, name: str) -> str:
+    """Why a column cannot be searched; empty where it can."""
+    values = np.asarray(record.signals[name])[: record.rows][record.present]
+    missing = int((~np.isfinite(values)).sum())
+    if missing:
+        return f"{name} is missing in {missing} of {len(values)} rows"
+    return "" if np.ptp(values) > 0 else f"{name} does not vary"
 
 
 def _weighted(effect: Effect, signals: Signals, rate: np.ndarray) -> np.ndarray:

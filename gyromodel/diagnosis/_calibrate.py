@@ -37,15 +37,15 @@ def null_scores(
         seed: of the draws.
         say: progress.
     """
-    kept = _cache_folder() / f"{_design(scanner, baseline, draws, seed)}.npy"
+    columns = np.asarray(baseline.model.linearise(scanner.record.signals)[1])
+    kept = _cache_folder() / f"{_design(scanner, baseline, columns, draws, seed)}.npy"
     if kept.exists():
         return np.load(kept)
     skip = skipped(baseline.model)
-    cells = scanner.only_cells
+    cells = [0] if scanner.stated else scanner.only_cells
     if cells is None:
         cells = cells_of_weight(rank(scanner, scanner.coarse_cells(), baseline, (), skip), NEARBY)
     filter = filter_of(scanner.record, baseline.ratios)
-    columns = np.asarray(baseline.model.linearise(scanner.record.signals)[1])
     prior = scanner.grid.log_prior[cells][:, None]
     rng = np.random.default_rng(seed)
     scores = []
@@ -69,10 +69,12 @@ def _cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "gyromodel" / "thresholds"
 
 
-def _design(scanner: Scanner, baseline: Estimate, draws: int, seed: int) -> str:
+def _design(scanner: Scanner, baseline: Estimate, columns: np.ndarray, draws: int, seed: int) -> str:
     """A digest of all that the draws depend on; noise ratios to a fifth of a decade."""
-    digest = hashlib.sha256(f"{__version__} {baseline.model.labels} {draws} {seed}".encode())
-    digest.update(np.round(scanner.bank.columns, 9).tobytes() + scanner.present.tobytes())
+    digest = hashlib.sha256(f"{__version__} {baseline.model.labels} {scanner.stated} {draws} {seed}".encode())
+    sampling = scanner.record.sampling
+    for part in (scanner.bank.columns, columns, scanner.present, sampling.interval, sampling.white):
+        digest.update(np.round(np.asarray(part, float), 9).tobytes())
     ratios = [round(5 * np.log10(max(float(r), 1e-30))) for r in baseline.ratios]
     digest.update(f"{ratios} {scanner.grid.interval} {scanner.grid.span}".encode())
     return digest.hexdigest()[:32]

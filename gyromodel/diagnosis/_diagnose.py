@@ -19,15 +19,16 @@ from gyromodel.diagnosis._result import Candidate, Diagnosis, Gain, Round
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import Found, NoisePath, Progress, Selection, search, standing
 from gyromodel.diagnosis._variance import growing_noise, noise_level, tails, with_variance
-from gyromodel.diagnosis._verdict import driver_shape, judge, minimum_detectable, testable
-from gyromodel.estimate import Estimate, EstimateError, fit_record, with_noise_intervals
+from gyromodel.diagnosis._verdict import driver_shape, judge, minimum_detectable, not_testable
+from gyromodel.estimate import Estimate, EstimateError, check_covariates, fit_record, with_noise_intervals
 from gyromodel.model import GyroModel, record_span
 from gyromodel.noise import NoiseGrid, NoiseRatios, noise_grid
-from gyromodel.signals import Record, read_signals
+from gyromodel.signals import Record, read_signals, with_columns_known
 from gyromodel.units import convertible, factor, from_internal
 
 # ln of the evidence ratio that no noise in or near the family reaches once in a hundred campaigns.
 SAFE_THRESHOLD = 4.0
+FEWEST_DRAWS = 200
 # Folds search the noise cells within this many nats of the best of the main pass.
 FOLD_NEARBY = 3.0
 
@@ -54,9 +55,9 @@ class _Session:
         for i in range(2, len(selection.estimates)):
             now, before = self.ladder(selection.estimates[i]), self.ladder(selection.estimates[i - 1])
             if selection.path[i - 1].effect is not None and now[0] > before[0] and now[1] < before[1]:
-                path, estimates = selection.path[: i - 1], selection.estimates[:i]
-                last = selection.path[i - 1].ranking
-                return Selection(estimates[-1], tuple(standing(path)), path, last, estimates, selection.driver)
+                path, estimates, step = selection.path[: i - 1], selection.estimates[:i], selection.path[i - 1]
+                found = tuple(standing(path))
+                return Selection(estimates[-1], found, path, step.ranking, estimates, None, remains=step.name)
         return selection
 
 
@@ -76,13 +77,16 @@ def diagnose(
         model: what the simulation contains.
         hold_out: whether to repeat the search without each block for the gain on data not seen; half of the work
             or more.
-        calibrate: draws of simulated data with nothing hidden that set the threshold; 0 takes the safe threshold.
+        calibrate: draws of simulated data with nothing hidden that set the threshold, 200 or more; 0 takes the safe
+            threshold.
         seed: of those draws.
         progress: called with a line and the fraction done.
 
     Raises:
         CampaignError, ModelError, EstimateError: the data or the model cannot answer; the message says why.
     """
+    if 0 < calibrate < FEWEST_DRAWS:
+        raise ValueError(f"{calibrate} draws cannot show a 99 % point: calibrate with {FEWEST_DRAWS} or more, or 0")
     say = progress or (lambda line, done: None)
     campaigns = [campaigns] if isinstance(campaigns, Campaign) else list(campaigns)
     findings = []
@@ -94,6 +98,9 @@ def diagnose(
             "averaged away."
         )
     record = read_signals([c for c, _ in shortened])
+    check_covariates(record, model)
+    record, left_out = with_columns_known(record)
+    findings += left_out
     say("fitting the simulation", 0.02)
     baseline = fit_record(record, model)
     say("laying out the search", 0.06)
@@ -103,7 +110,7 @@ def diagnose(
     nulls = np.zeros(0)
     if calibrate:
         nulls = null_scores(session.scanner, baseline, calibrate, seed, say)
-        session.threshold = float(np.quantile(nulls, 0.99))
+        session.threshold = max(float(np.quantile(nulls, 0.99)), 0.0)
     selection = session.run(baseline, say)
     grows = growing_noise(record, selection.estimate)
     if grows is not None:
@@ -121,13 +128,14 @@ def diagnose(
     scale = factor("rad/s", unit)
     ordinary = tuple(hold_out and session.ladder(e)[2] for e in (baseline, selection.estimate))
     extended = _finished(selection.estimate, ordinary[1])
+    weights = ordinary[0], extended.ordinary
     if extended.ordinary:
         findings.append(
             "Parameters weigh all samples alike: that predicts left-out blocks better than the fitted noise's weights "
             "do."
         )
     judgement = judge(record, session.scanner, baseline, selection, extended, len(bank.names()), nulls)
-    gain = not_measured(unit) if not hold_out else _gain(session, baseline, selection, unit, scale, ordinary, say)
+    gain = not_measured(unit) if not hold_out else _gain(session, baseline, selection, unit, scale, weights, say)
     driver = driver_shape(session.scanner, selection, judgement.driver, unit) if judgement.driver else None
     say("done", 1.0)
     whole = shortened[0][0] if len(shortened) == 1 else _together([c for c, _ in shortened])
@@ -144,7 +152,7 @@ def diagnose(
         gain=gain,
         next_test=judgement.next_test,
         minimum_detectable=minimum_detectable(session.scanner, selection.last, session.threshold, unit),
-        not_testable=bank.not_testable | testable(session.scanner, selection.last),
+        not_testable=bank.not_testable | not_testable(session.scanner, selection.last, selection.estimate.model),
         noise=extended.noise_table(),
         rounds=_rounds(session, selection, scale, hold_out),
         credible_set=judgement.credible_set,
@@ -256,4 +264,6 @@ def _together(campaigns: list[Campaign]) -> Campaign:
         start = columns["time"][-1][-1] + np.median(np.diff(time))
         for name in names:
             columns[name].append(campaign.in_unit(name, first.units[name]))
-    return Campaign({n: np.concatenate(v) for n, v in columns.items()}, first.units, first.metadata, first.name)
+    whole = Campaign({n: np.concatenate(v) for n, v in columns.items()}, first.units, first.metadata, first.name)
+    number = np.repeat(1.0 + np.arange(len(campaigns)), [len(c) for c in campaigns])
+    return whole if "campaign" in names else whole.with_column("campaign", number, "")

@@ -49,8 +49,8 @@ def ladder_error(record: Record, estimate: Estimate) -> tuple[float, float, bool
     """Held-out error of one model structure, refitted without each block.
 
     Returns:
-        rms (rad/s), log score, and whether ordinary least squares left the smaller rms (by more than chance would at
-        5 %).
+        rms (rad/s), log score, and whether ordinary least squares left an rms smaller by a tenth or more; NaN where
+        some block cannot be predicted, so that structures are compared on the same blocks.
     """
     errors: dict[bool, list[np.ndarray]] = {False: [], True: []}
     score = 0.0
@@ -61,13 +61,11 @@ def ladder_error(record: Record, estimate: Estimate) -> tuple[float, float, bool
             # From the other solution it is a step or two.
             again = fit_record(train.record, train.model_as_given(), ratios=estimate.ratios, ordinary=True)
         except EstimateError:
-            continue
+            return np.nan, -np.inf, False
         for ordinary, fitted in ((False, train), (True, again)):
             error, log_score = held_out(record, fitted, rows)
             errors[ordinary].append(error)
             score += 0.0 if ordinary else log_score
-    if not errors[True]:
-        return np.nan, -np.inf, False
     rms = {k: float(np.sqrt(np.mean(np.concatenate(v) ** 2))) for k, v in errors.items()}
     better = rms[True] < ORDINARY_MARGIN * rms[False]
     return rms[better], score, better
@@ -94,7 +92,7 @@ def nested_gain(
         progress: called with folds done and in all.
     """
     before, after, scores = [], [], []
-    blocks = blocks_of(record)
+    blocks, scheme = blocks_of(record), record.block_scheme
     for k, rows in enumerate(blocks):
         try:
             base = fit_record(record.without(rows), baseline.model_as_given(), ratios=baseline.ratios)
@@ -108,7 +106,9 @@ def nested_gain(
         scores.append(s1 - s0)
         if progress:
             progress(k + 1, len(blocks))
-    return _summary(np.array(before), np.array(after), np.array(scores), record.block_scheme, unit, scale)
+    if lost := len(blocks) - len(scores):
+        scheme += f" ({lost} more could not be predicted)"
+    return _summary(np.array(before), np.array(after), np.array(scores), scheme, unit, scale)
 
 
 def _errors(record: Record, train: Estimate, rows: np.ndarray, ordinary: bool) -> tuple[np.ndarray, float]:

@@ -14,8 +14,8 @@ from gyromodel.signals import Record
 # A line's energy is computed exactly at the lowest frequencies, at log-spaced ones to interpolate between, and at the
 # leading peaks of each pass, whose correction holds for their neighbours too.
 LOWEST_LINES, SPACED_LINES, PEAKS, PEAK_WIDTH = 24, 24, 12, 6
-# Lines closer than this many steps of the grid are one line to the record, whose resolution is 1/span.
-RESOLVED = 4
+# Lines closer than this many steps of the grid (a quarter of the resolution each) are one that is not steady.
+RESOLVED = 8
 # Fewer cycles in the record than this are a trend, not a line.
 FEWEST_CYCLES = 1.5
 

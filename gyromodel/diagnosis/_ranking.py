@@ -29,9 +29,9 @@ class Ranking:
     walks: dict[int, bool] = field(repr=False)
     baseline_columns: np.ndarray = field(repr=False)
 
-    def best(self, *, drivers: bool, but: str = "") -> tuple[str | None, float]:
-        """The best unknown driver, or the best named candidate (but one), and its evidence ratio (ln)."""
-        mine = {k: v for k, v in self.statistic.items() if is_driver(k) == drivers and k != but}
+    def best(self, *, drivers: bool, but: tuple[str, ...] = ()) -> tuple[str | None, float]:
+        """The best unknown driver, or the best named candidate (but some), and its evidence ratio (ln)."""
+        mine = {k: v for k, v in self.statistic.items() if is_driver(k) == drivers and k not in but}
         top = max(mine, key=lambda k: mine[k]) if mine else None
         return top, mine[top] if top else -np.inf
 
@@ -106,9 +106,16 @@ def rank(
     for name in sorted({n for r in results.values() for n in r.evidence} - skip):
         each = [results[g].evidence.get(name, -np.inf) for g in cells]
         statistic[name] = log_sum(logs + np.array(each)) - null
+    # Noise beyond the statement must beat all noise within it: less than stated lacks nothing.
+    within = np.array([everything[g].log_likelihood for g in families.pop("", [])])
+    within_stated = max(null, log_sum(within) - np.log(len(within))) if len(within) else null
     for name, family in families.items():
-        more = np.array([everything[g].log_likelihood for g in family])
-        statistic[name] = log_sum(more) - np.log(len(family)) - null
+        # More of it than stated, whatever the white noise turns out to be beside it.
+        kind = scanner.grid.ratios.flicker if name == "noise_flicker" else scanner.grid.ratios.walk
+        level = [float(kind[g]) * everything[g].rss / everything[cells[0]].rss for g in family]
+        more = [everything[g].log_likelihood for g, v in zip(family, level, strict=True) if v > float(kind[0])]
+        if more:
+            statistic[name] = log_sum(more) - np.log(len(family)) - within_stated
     total = log_sum(list(statistic.values())) if statistic else 0.0
     posterior = {k: float(np.exp(v - total)) for k, v in statistic.items()}
     walk, flicker = scanner.grid.ratios.walk, scanner.grid.ratios.flicker
@@ -120,10 +127,11 @@ def rank(
 def rank_where_it_matters(scanner: Scanner, estimate: Estimate, pulses: tuple[int, ...]) -> Ranking:
     """Rank over the noise cells that matter: every other level, then neighbours of those with weight for any."""
     skip = skipped(estimate.model)
-    if scanner.only_cells is not None and (estimate.noise_given or not scanner.stated):
-        return rank(scanner, scanner.only_cells, estimate, pulses, skip)
     if scanner.stated:
-        return rank(scanner, scanner.all_cells(), estimate, pulses, skip)
+        cells = [0] if estimate.noise_given else scanner.only_cells or scanner.all_cells()
+        return rank(scanner, cells, estimate, pulses, skip)
+    if scanner.only_cells is not None:
+        return rank(scanner, scanner.only_cells, estimate, pulses, skip)
     ranking = rank(scanner, scanner.coarse_cells(), estimate, pulses, skip)
     near = set(cells_of_weight(ranking, NEARBY))
     return rank(scanner, scanner.neighbours(near), estimate, pulses, skip, ranking.results)
@@ -147,6 +155,7 @@ def line_frequencies(model: GyroModel) -> np.ndarray:
 
 
 def skipped(model: GyroModel) -> set[str]:
-    """Candidates that make no sense beside a model: what it has, and what it has in a more general form."""
+    """Candidates that make no sense beside a model: what it has free, and what it has in a more general form."""
+    held = model.wholly_fixed()
     have = {name for e in model.effects for name in (e.label, *e.supersedes)}
-    return have - {"bias_step", "bias_periodic"}
+    return have - held - {"bias_step", "bias_periodic"}

@@ -86,13 +86,12 @@ class Scanner:
         self.record, self.bank, self.grid = record, bank, grid
         self.present = np.asarray(record.sampling.present)
         self.runs = int(np.asarray(record.sampling.restart).sum())
-        single = self.runs == 1
-        self.steps = single and "bias_step" in bank.scans
-        self.lines = line_grid(record) if single and "bias_periodic" in bank.scans and record.rows >= 16 else None
+        self.steps = "bias_step" in bank.scans
+        self.lines = line_grid(record) if "bias_periodic" in bank.scans and record.rows >= 16 else None
         self.outliers = outliers
         # With stated noise the first cell is the statement, and the rest are what it may lack.
         self.stated = stated
-        self.only_cells = self.all_cells()[: 1 if stated else None] if stated or len(grid.log_prior) == 1 else None
+        self.only_cells = self.all_cells() if len(grid.log_prior) == 1 else None
         self.by_points = int(self.present.sum()) <= TEST_POINTS
         self.cells = Cells(record.sampling, grid, bank, self.lines)
         # Blocks of one name together and, within it, of one structure.
@@ -122,12 +121,19 @@ class Scanner:
         return list(range(len(self.grid.log_prior)))
 
     def noise_families(self) -> dict[str, list[int]]:
-        """Cells with more of one kind of noise than stated, and no more of the other; none where noise is estimated."""
+        """Cells by how they differ from the stated noise; none where noise is estimated.
+
+        More of one kind than stated and no more of the other, under that kind's id; no more of either, under "".
+        """
         if not self.stated:
             return {}
         flicker, walk = (np.asarray(r) for r in self.grid.ratios)
         more_flicker, more_walk = flicker > 1.5 * flicker[0], walk > 1.5 * walk[0]
-        families = {"noise_flicker": more_flicker & ~more_walk, "noise_random_walk": more_walk & ~more_flicker}
+        families = {
+            "": ~more_flicker & ~more_walk,
+            "noise_flicker": more_flicker & ~more_walk,
+            "noise_random_walk": more_walk & ~more_flicker,
+        }
         return {name: [int(g) for g in np.flatnonzero(f)] for name, f in families.items() if f.any()}
 
     def _levels(self) -> tuple[np.ndarray, np.ndarray]:
@@ -253,6 +259,7 @@ class Scanner:
             energy[here] = np.sum(values * keep, axis=1) / np.maximum(q_of[here], 1) * np.mean(norm**2, axis=1)
         # A form that loses more columns than the baseline contains is another form in disguise.
         sound = q_of >= least
+        energy[~sound] = 0.0
         ratio = np.where(sound[:, None], log_evidence_ratio(t_of, batch.rss, nu, q_of[:, None]), -np.inf)[self._order]
         # Structures compete by their mean over shapes; the best shape of the best structure stands for the name.
         means, shapes = log_mean_of_parts(ratio, self._structure_starts)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import jax.numpy as jnp
 import numpy as np
 
+from gyromodel.diagnosis._bank import smooth_columns
 from gyromodel.diagnosis._evidence import log_evidence_ratio, log_sum
 from gyromodel.diagnosis._lines import RESOLVED
 from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise, line_frequencies, rank_where_it_matters
@@ -81,8 +82,8 @@ def search(
     threshold: float,
     *,
     progress: Progress = None,
-    rounds: int = MAXIMUM_ROUNDS,
     noise: NoisePath = (),
+    avoid: str = "",
 ) -> Selection:
     """Add candidates until nothing more is significant.
 
@@ -92,8 +93,8 @@ def search(
         baseline: the fitted simulation.
         threshold: least ln evidence ratio of an addition.
         progress: called with a line and the fraction done.
-        rounds: at most this many additions.
         noise: noise ratios to hold in the fits, see `refit`.
+        avoid: a name that is not to be the first.
     """
     path: list[Found] = []
     estimates, remains = [baseline], ""
@@ -103,10 +104,10 @@ def search(
         ranking = rank_where_it_matters(scanner, estimate, pulses)
         full = len(line_frequencies(estimate.model)) >= MAXIMUM_LINES
         remains = "bias_periodic" if full and ranking.statistic.get("bias_periodic", -np.inf) >= threshold else ""
-        name, score = ranking.best(drivers=False, but="bias_periodic" if full else "")
-        if name is None or (score < threshold and not _slow_structure(ranking, name, score, threshold)):
+        name, score = ranking.best(drivers=False, but=("bias_periodic" if full else "", "" if path else avoid))
+        if name is None or (score < threshold and not _slow_structure(ranking, name, score, threshold, scanner.runs)):
             break
-        if len(path) >= rounds:
+        if len(path) >= MAXIMUM_ROUNDS:
             remains = name
             break
         steps = [i for i, f in enumerate(path) if f.name == "bias_step"]
@@ -127,7 +128,13 @@ def search(
             break
     driver, score = path[0].ranking.best(drivers=True) if path else (None, -np.inf)
     if score > max(sum(f.ranking.statistic[f.name] for f in path) + EXCHANGE, threshold):
-        # One smooth driver explains more than all the names together.
+        # One smooth driver explains more than all the names together; names of its own columns may have had to stand
+        # back behind one that follows several of them.
+        own, first = set(smooth_columns(str(driver))), path[0].effect
+        if not avoid and first is not None and not own >= set(first.columns_needed):
+            other = search(record, scanner, baseline, threshold, progress=progress, noise=noise, avoid=path[0].name)
+            if other.found:
+                return other
         return Selection(baseline, (), (), path[0].ranking, (baseline,), driver)
     found, left_out = standing(path), {}
     if sum(f.effect is not None for f in found) > 1:
@@ -168,9 +175,9 @@ def standing(path: Sequence[Found]) -> list[Found]:
     return kept[::-1]
 
 
-def _slow_structure(ranking: Ranking, name: str, score: float, threshold: float) -> bool:
+def _slow_structure(ranking: Ranking, name: str, score: float, threshold: float, runs: int) -> bool:
     """Whether a slow change in time is certain, and only a random walk keeps its cause from being so."""
-    if name not in SLOW_IN_TIME or score < SLOW_LEAD:
+    if name not in SLOW_IN_TIME or score < SLOW_LEAD or runs > 1:
         return False
     still = [g for g, walks in ranking.walks.items() if not walks]
     logs = np.array([ranking.results[g].log_likelihood + ranking.log_prior[g] for g in still])
@@ -187,7 +194,8 @@ def _addition(scanner: Scanner, estimate: Estimate, ranking: Ranking, name: str,
         rows = form if isinstance(form, tuple) else (form,)
         return Found(name, None, tuple(int(r) for r in rows), ranking)
     assert isinstance(form, int)
-    effect = form_effect(scanner, name, form)
+    fixed = [e for e in estimate.model.effects if e.label == name and name in estimate.model.wholly_fixed()]
+    effect = fixed[0] if fixed else form_effect(scanner, name, form)
     assert effect is not None
     if isinstance(effect, BiasPeriodic):
         frequency = np.append(line_frequencies(estimate.model), _lines(scanner, ranking, estimate.model))
@@ -322,8 +330,38 @@ def _exchange(
     threshold: float,
     noise: NoisePath,
 ) -> tuple[list[Found], Estimate, dict[int, Ranking]]:
-    """Re-choose each earlier addition given all the others; also the rankings that speak of what was kept."""
+    """Choose each addition again given all the others, and drop those that the others have made needless.
+
+    Returns:
+        What stands, its fit, and the rankings beside all but one that speak of it.
+    """
+    while True:
+        found, estimate, rankings = _rechosen(record, scanner, baseline, found, estimate, threshold, noise)
+        own = {i: ranking.statistic.get(found[i].name, -np.inf) for i, ranking in rankings.items()}
+        needless = [i for i, v in own.items() if v < (SLOW_LEAD if found[i].name in SLOW_IN_TIME else threshold)]
+        if not needless or len(found) < 2:
+            return found, estimate, rankings
+        least = min(needless, key=lambda i: own[i])
+        fewer = found[:least] + found[least + 1 :]
+        after = refit(record, baseline, fewer, noise)
+        if after is None:
+            return found, estimate, rankings
+        found, estimate = fewer, after
+
+
+def _rechosen(
+    record: Record,
+    scanner: Scanner,
+    baseline: Estimate,
+    found: list[Found],
+    estimate: Estimate,
+    threshold: float,
+    noise: NoisePath,
+) -> tuple[list[Found], Estimate, dict[int, Ranking]]:
+    """One pass: each addition exchanged for a better one given all the others."""
     rankings: dict[int, Ranking] = {}
+    if len(found) < 2:
+        return found, estimate, rankings
     for i in range(len(found)):
         if found[i].effect is None or uncontested(found[i]):
             continue
@@ -333,7 +371,7 @@ def _exchange(
         rankings[i] = ranking
         others = found[:i] + found[i + 1 :]
         # Further lines would come on top of the others, not in the place of this one.
-        name, score = ranking.best(drivers=False, but="bias_periodic" if _has_lines(others) else "")
+        name, score = ranking.best(drivers=False, but=("bias_periodic",) if _has_lines(others) else ())
         own = ranking.statistic.get(found[i].name, -np.inf)
         if (
             name is None
@@ -347,6 +385,8 @@ def _exchange(
             continue
         step = _addition(scanner, base, ranking, name, tuple(r for f in others for r in f.rows))
         changed = [*others[:i], step, *others[i:]]
+        if len(standing(changed)) < len(changed):
+            continue
         after = refit(record, baseline, changed, noise)
         if after is not None:
             found, estimate, rankings = changed, after, {i: ranking}

@@ -93,6 +93,6 @@ def noise_level(estimate: Estimate) -> str | None:
     if 2 * min(stats.chi2.sf(nu * ratio, nu), stats.chi2.cdf(nu * ratio, nu)) > CONTRADICTED:
         return None
     return (
-        f"The noise is {np.sqrt(ratio):.2f} times as large as the model states; uncertainties are those of "
+        f"The noise is {np.sqrt(ratio):.3g} times as large as the model states; uncertainties are those of "
         "the level in the data."
     )

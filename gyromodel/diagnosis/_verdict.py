@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import comb
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +11,7 @@ from scipy import stats
 
 from gyromodel.diagnosis._bank import smooth_columns
 from gyromodel.diagnosis._evidence import explained_for
-from gyromodel.diagnosis._ranking import Ranking, is_driver
+from gyromodel.diagnosis._ranking import Ranking, is_driver, skipped
 from gyromodel.diagnosis._result import Cause, Confuser, Driver, ParameterValue, Verdict
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import (
@@ -24,7 +25,7 @@ from gyromodel.diagnosis._search import (
 )
 from gyromodel.effects import Effect
 from gyromodel.estimate import Estimate
-from gyromodel.model import effect_class, parameter_unit
+from gyromodel.model import GyroModel, effect_class, parameter_unit
 from gyromodel.signals import Record
 from gyromodel.units import factor, from_internal, internal_unit
 
@@ -56,7 +57,8 @@ def credible(
 
     Names in `beside` come on top of this cause, not in its place.
     """
-    apart = beside | (set() if name == "outliers" else {"outliers"})
+    # A step at the edge of the record is a gross error as well.
+    apart = beside | (set() if name in ("outliers", "bias_step") else {"outliers"})
     own = {k: v for k, v in ranking.statistic.items() if not is_driver(k) and (k == name or k not in apart)}
     hidden_by_walk = name in NO_EDGE and ranking.walks[ranking.best_cell(name)]
     too_close = name in SLOW_IN_TIME and statistic < TIME_MARGIN and ranking.slow_noise
@@ -73,10 +75,11 @@ def credible(
     for k in list(chosen):
         general = [m for m in chosen if m != k and k in _supersedes(m)]
         if general and k in chosen:
-            loser = min((k, general[0]), key=lambda n: chosen[n])
+            loser = min((k, general[0]), key=lambda n: (n == name, chosen[n]))
             winner = general[0] if loser == k else k
             chosen[winner] += chosen.pop(loser)
-    return chosen
+    # What was added and is not among the likeliest is in doubt with them.
+    return chosen if name in chosen else chosen | {name: weight[name] / total}
 
 
 def _supersedes(name: str) -> tuple[str, ...]:
@@ -99,23 +102,27 @@ def judge(
     runs = scanner.runs
     causes, sets, findings = [], [], []
     for i, step in enumerate(found):
-        ranking = selection.left_out.get(i) or step.ranking
-        if len(found) > 1 and i not in selection.left_out and not uncontested(step):
-            ranking = leave_one_out(record, scanner, baseline, found, i) or step.ranking
-        name = step.name
-        statistic = ranking.statistic.get(name, step.ranking.statistic[name])
+        ranking, name = selection.left_out.get(i), step.name
+        if ranking is None and len(found) > 1 and not uncontested(step):
+            ranking = leave_one_out(record, scanner, baseline, found, i)
+        if ranking is None or name not in ranking.statistic:
+            ranking = step.ranking
+        statistic = ranking.statistic[name]
         beside = frozenset(f.name for f in found if f is not step) | {selection.remains}
         members = credible(ranking, name, statistic, runs=runs, beside=beside)
         if name == "outliers":
             if scanner.by_points and _unrepeated(record, step.rows):
-                members = {"outliers": members.get("outliers", 1.0) * 0.5, "scale_spline": 0.5}
+                members = {k: 0.5 * share for k, share in members.items()} | {"scale_spline": 0.5}
             elif not scanner.by_points:
                 some = ", ".join(str(r + 1) for r in step.rows[:8])
                 findings.append(f"Gross error in data row {some}: given up, not modelled.")
                 continue
+        if name in baseline.model.wholly_fixed():
+            findings.append(f"{name} is fixed in the simulation at a value that the data contradict: it was set free.")
         close = _close_rival(step, members)
         findings += [close] if close else []
-        causes.append(_cause(scanner, extended, step, ranking, members, statistic, trials, null_scores))
+        turn = sum(f.name == name for f in found[i:])
+        causes.append(_cause(scanner, extended, step, turn, ranking, members, statistic, trials, null_scores))
         sets.append(members)
     order = sorted(range(len(causes)), key=lambda i: -causes[i].statistic)
     causes, sets = [causes[i] for i in order], [sets[i] for i in order]
@@ -134,26 +141,20 @@ def judge(
         return Judgement("unknown", (), {selection.remains: 1.0}, None, None, unexplained, tuple(findings))
     if not causes:
         return Judgement("adequate", (), {}, None, None, unexplained, tuple(findings))
-    if len(sets[0]) > 1:
-        names = list(sets[0])
-        return Judgement(
-            "ambiguous",
-            _as_set(causes[0], sets[0]),
-            sets[0],
-            None,
-            _next_test(names, record, causes[0]),
-            unexplained,
-            tuple(findings),
-        )
     named = tuple(c for c, s in zip(causes, sets, strict=True) if len(s) == 1)
-    for cause, members in zip(causes, sets, strict=True):
+    for cause, members in zip(causes[1:], sets[1:], strict=True):
         if len(members) > 1:
             others = " or ".join(members)
             findings.append(
                 f"The extended model also holds {cause.effect}, which this campaign cannot tell from the others of: "
                 f"{others}."
             )
-    return Judgement("named", named, sets[0], None, None, unexplained, tuple(findings))
+    if len(sets[0]) == 1:
+        return Judgement("named", named, sets[0], None, None, unexplained, tuple(findings))
+    doubtful = _as_set(causes[0], sets[0])
+    firm = tuple(c for c in named if c.effect not in sets[0])
+    test = _next_test(list(sets[0]), record, causes[0])
+    return Judgement("ambiguous", (*doubtful, *firm), sets[0], None, test, unexplained, tuple(findings))
 
 
 def _close_rival(step: Found, members: dict[str, float]) -> str | None:
@@ -188,7 +189,7 @@ def _as_set(cause: Cause, members: dict[str, float]) -> tuple[Cause, ...]:
 def _unrepeated(record: Record, rows: tuple[int, ...]) -> bool:
     """Whether some anomalous point's rate was measured only once, so that a curve through it cannot be excluded."""
     if "rate" not in record.signals:
-        return True
+        return False
     rate = np.asarray(record.signals["rate"])[: record.rows]
     tolerance = 1e-3 * np.ptp(rate) + 1e-12
     return any(np.sum(np.abs(rate - rate[r]) < tolerance) < 3 for r in rows)
@@ -202,8 +203,10 @@ def _next_test(names: list[str], record: Record, cause: Cause) -> str:
             f"Repeat the points at {levels} deg/s several times, in both directions and in random order: anomalous "
             "test points do not come back, a curve does."
         )
-    if "noise_random_walk" in names:
-        return "Repeat the run: a deterministic change comes back the same, a random walk does not."
+    if any(n.startswith("noise_") for n in names) and not all(n.startswith("noise_") for n in names):
+        return "Repeat the run: a deterministic change comes back the same, noise does not."
+    if all(n.startswith("noise_") for n in names):
+        return "A longer record at rest: flicker levels off in the Allan deviation, a random walk goes on rising."
     tests = [effect_class(n).test for n in names if n != "outliers" and not n.startswith("noise_")]
     return " ".join(dict.fromkeys(tests))
 
@@ -212,6 +215,7 @@ def _cause(
     scanner: Scanner,
     estimate: Estimate,
     step: Found,
+    turn: int,
     ranking: Ranking,
     members: dict[str, float],
     statistic: float,
@@ -228,9 +232,9 @@ def _cause(
     g = ranking.best_cell(name)
     result = ranking.results[g]
     _, explained, q = result.best[name]
-    nu = scanner.degrees_of_freedom
+    nu = scanner.degrees_of_freedom - ranking.baseline_columns.shape[1]
     p = float(stats.beta.sf(min(explained / result.rss, 1.0), q / 2, max(nu - q, 1) / 2))
-    shapes = len(result.energy.get(name, ())) or 1
+    shapes = comb(len(result.energy[name]), int(q)) if step.rows else len(result.energy.get(name, ())) or 1
     adjusted = float(min(1.0, p * shapes * trials))
     if len(null_scores):
         adjusted = float((1 + np.sum(null_scores >= statistic)) / (1 + len(null_scores)))
@@ -241,18 +245,25 @@ def _cause(
         if "scale_spline" in members:
             confusers = (Confuser("scale_spline", 0.0), *confusers)
     else:
-        parameters = tuple(ParameterValue(r.name, r.value, r.std, r.unit) for r in estimate.table() if r.effect == name)
+        rows = [r for r in estimate.table() if r.effect == name]
+        # Of several steps, the one that stands `turn` from the last.
+        each = len(rows) // estimate.model.labels.count(name)
+        rows = rows[len(rows) - turn * each :][:each]
+        parameters = tuple(ParameterValue(r.name, r.value, r.std, r.unit) for r in rows)
     return Cause(name, parameters, statistic, p, adjusted, members.get(name, 0.0), confusers, tuple(step.rows))
 
 
 def _point_parameters(record: Record, estimate: Estimate, rows: tuple[int, ...]) -> tuple[ParameterValue, ...]:
     predicted = np.asarray(estimate.model.predict(record.signals))
-    gain = float(estimate.model.gain())
+    slope = np.asarray(estimate.model.slope(record.signals))
+    jacobian = np.asarray(estimate.model.linearise(record.signals)[1])
     scale = factor("rad/s", "deg/s")
     found = []
     for r in sorted(rows):
-        shift = (float(record.signals["output"][r]) - predicted[r]) / gain
-        std = float(np.sqrt(estimate.white_variance)) / abs(gain)
+        shift = (float(record.signals["output"][r]) - predicted[r]) / slope[r]
+        # Of the point and of the model, which was fitted without it.
+        variance = estimate.white_variance + jacobian[r] @ estimate.covariance @ jacobian[r]
+        std = float(np.sqrt(variance)) / abs(slope[r])
         rate = float(record.signals["rate"][r]) * scale if "rate" in record.signals else None
         label = f"shift at {rate:.4g} deg/s" if rate is not None else f"shift at data row {r + 1}"
         found.append(ParameterValue(label, shift * scale, std * scale, "deg/s"))
@@ -342,7 +353,7 @@ def driver_shape(scanner: Scanner, selection: Selection, name: str, unit: str) -
     keep = s > 1e-5 * s[0]
     inverse = vt[keep].T / s[keep]
     solution = inverse @ (u[:, keep].T @ w[:, -1])
-    variance = float(np.sum((w[:, -1] - w[:, :-1] @ (solution / norm)) ** 2)) / max(scanner.degrees_of_freedom, 1)
+    variance = float(np.sum((w[:, -1] - w[:, :-1] @ (solution / norm)) ** 2)) / max(scanner.degrees_of_freedom - p, 1)
     covariance = inverse @ inverse.T * variance
     shape = columns[: record.rows] / norm[p:]
     shape = shape - shape.mean(0)
@@ -361,7 +372,7 @@ def minimum_detectable(scanner: Scanner, ranking: Ranking, threshold: float, uni
     """Size of each searched effect that would have been found with 80 % probability, at the noise of the final fit."""
     g = ranking.best_cell()
     result = ranking.results[g]
-    nu = scanner.degrees_of_freedom
+    nu = scanner.degrees_of_freedom - ranking.baseline_columns.shape[1]
     sigma = np.sqrt(result.rss / nu)
     sizes: dict[str, tuple[float, str]] = {}
     widths = {b.name: b for b in reversed(scanner.bank.blocks)}
@@ -386,11 +397,11 @@ def _in_unit(scanner: Scanner, name: str, effect: Effect | None, q: int, size: f
     return size * factor(internal_unit(declared), declared), declared
 
 
-def testable(scanner: Scanner, ranking: Ranking) -> dict[str, str]:
-    """Candidates whose columns vanish beside the model, with the reason."""
+def not_testable(scanner: Scanner, ranking: Ranking, model: GyroModel) -> dict[str, str]:
+    """Candidates that a model does not have and whose columns vanish beside it, with the reason."""
     result = ranking.results[ranking.best_cell()]
     return {
         name: "cannot be told from what the model already has on this campaign"
-        for name in {b.name for b in scanner.bank.blocks if b.kind == "effect"}
+        for name in {b.name for b in scanner.bank.blocks if b.kind == "effect"} - skipped(model)
         if name not in result.evidence and not (result.energy.get(name, np.zeros(1)) > 0).any()
     }

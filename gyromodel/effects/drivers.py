@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from gyromodel.effects._base import Effect, Signals, parameter, setting, stack
+from gyromodel.effects._base import CATALOGUE, Effect, Signals, parameter, setting, stack
 
 
 class Bias(Effect):
@@ -83,6 +83,10 @@ class BiasPeriodic(Effect):
     sine: Float[Array, " line"] = parameter("deg/h", 1.0, "quadrature amplitude of each line", default=(0.0,))
     frequency: Float[Array, " line"] = parameter("Hz", 0.01, "their frequencies", linear=False, default=(0.01,))
 
+    def __check_init__(self) -> None:
+        if not jnp.shape(self.cosine) == jnp.shape(self.sine) == jnp.shape(self.frequency):
+            raise ValueError("every line needs a cosine, a sine and a frequency")
+
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """The cosines, then the sines."""
         phase = 2.0 * jnp.pi * signals["time"][:, None] * self.frequency
@@ -119,8 +123,10 @@ class BiasColumn(Effect):
 
     @property
     def label(self) -> str:
-        """bias_<column>."""
-        return f"bias_{self.column}"
+        """bias_<column>; bias_column_<column> where that would be another effect's id."""
+        plain = f"bias_{self.column}"
+        taken = plain in CATALOGUE or self.column.startswith("column_")
+        return f"bias_column_{self.column}" if taken else plain
 
     @property
     def columns_needed(self) -> tuple[str, ...]:

@@ -1,12 +1,21 @@
 """Joint generalised least squares with the noise estimated alongside; estimates carry their covariance."""
 
 from gyromodel.estimate._estimate import Estimate, EstimateError
-from gyromodel.estimate._fit import filter_of, fit, fit_record, make_filter, whiten_columns, with_noise_intervals
+from gyromodel.estimate._fit import (
+    check_covariates,
+    filter_of,
+    fit,
+    fit_record,
+    make_filter,
+    whiten_columns,
+    with_noise_intervals,
+)
 from gyromodel.estimate._two_stage import two_stage
 
 __all__ = [
     "Estimate",
     "EstimateError",
+    "check_covariates",
     "filter_of",
     "fit",
     "fit_record",

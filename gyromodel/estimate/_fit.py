@@ -99,14 +99,12 @@ def fit_record(
         solution = solve(model, solution.x, record, filter, solver)
         if turn and _close(before, ratios):
             break
+    estimate = _finish(record, model, ratios, filter, solution)
     if ordinary:
+        # The noise is what generalised least squares leaves: ordinary residuals are larger.
         solution = solve(model, solution.x, record, filter_of(record, white), solver)
-    if not solution.converged:
-        raise EstimateError(
-            f"the fit of {', '.join(model.labels)} did not converge in {solution.iterations} iterations: "
-            "give start values near the solution, or fix some parameters"
-        )
-    return _finish(record, model.with_vector(jnp.asarray(solution.x)), ratios, filter, solution, ordinary)
+        estimate = _finish(record, model, ratios, filter, solution, variance=estimate.white_variance)
+    return estimate
 
 
 def check_covariates(record: Record, model: GyroModel) -> None:
@@ -225,8 +223,16 @@ def _finish(
     ratios: NoiseRatios,
     filter: Filter,
     solution: Solution,
-    ordinary: bool,
+    variance: float | None = None,
 ) -> Estimate:
+    """The estimate at a solution; `variance` is the white one where the solution is that of ordinary least squares."""
+    if not solution.converged:
+        raise EstimateError(
+            f"the fit of {', '.join(model.labels)} did not converge in {solution.iterations} iterations: "
+            "give start values near the solution, or fix some parameters"
+        )
+    model = model.with_vector(jnp.asarray(solution.x))
+    ordinary = variance is not None
     predicted, jacobian = model.linearise(record.signals)
     output, present = record.signals["output"], record.sampling.present
     residual = jnp.where(present, output - predicted, 0.0)
@@ -238,7 +244,7 @@ def _finish(
     if ordinary:
         covariance = _ordinary_covariance(record, filter, jacobian, model)
     nu = len(w) - p
-    variance = float(w[:, p] @ w[:, p]) / nu
+    variance = float(w[:, p] @ w[:, p]) / nu if variance is None else variance
     likelihood = from_grams(np.atleast_1d(filter.log_determinant), (w.T @ w)[None], len(w)).log_likelihood[0]
     noise = dict(model.noise) or noise_coefficients(ratios, variance, record, float(model.gain()))
     rows = record.rows

@@ -29,7 +29,7 @@ _RANKED = 12
 
 
 def write_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> list[Path]:
-    """Write report.html, which needs no other file, and each of its figures as SVG under figures/.
+    """Write report.html, which needs no other file, and its figures as SVG under figures/, in place of older ones.
 
     Args:
         diagnosis: what `gyromodel.diagnose` returned.
@@ -52,6 +52,8 @@ def write_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> list[P
         path = folder / "figures" / f"{figure.name}.svg"
         write_text(path, figure.svg)
         written.append(path)
+    for stale in set((folder / "figures").glob("*.svg")) - set(written):
+        stale.unlink()
     write_text(folder / "report.html", page)
     return [folder / "report.html", *written]
 

@@ -122,6 +122,8 @@ def _with_size(cause: Cause) -> str:
 def _gain(diagnosis: Diagnosis, extension: str) -> str:
     """How the error on held-out data moved, and whether that is more than its own scatter."""
     gain = diagnosis.gain
+    if gain.scheme == "not measured":
+        return "the gain on data not used was not measured"
     if not (math.isfinite(gain.before) and math.isfinite(gain.after)):
         return "the campaign is too short to measure the gain on data not used"
     before, after = pair(gain.before, gain.after)

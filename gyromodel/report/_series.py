@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gyromodel.declarations import column_of
 from gyromodel.report._words import spoken
 
 if TYPE_CHECKING:
@@ -99,7 +100,7 @@ def follows(effect: str, known: Mapping[str, Abscissa]) -> list[str]:
     elif effect.startswith(_BY_TIME):
         keys = ["time"]
     else:
-        keys = [effect.removeprefix("bias_")]
+        keys = [column_of(effect)]
     return [key for key in known if key in keys or any(key.startswith(f"{k}:") for k in keys if ":" in k)]
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
+from gyromodel.declarations import column_of
+
 PHRASES = {
     "scale_factor": "a scale-factor error",
     "scale_asymmetry": "a scale-factor asymmetry between the two senses of rotation",
@@ -93,7 +95,7 @@ def phrase(effect: str, kind: str = "effect") -> str:
     if base in PHRASES:
         return PHRASES[base] + (f" ({spoken(detail)})" if detail else "")
     if base.startswith("bias_"):
-        return f"a bias proportional to {spoken(effect.removeprefix('bias_'))}"
+        return f"a bias proportional to {spoken(column_of(effect))}"
     return f"an effect named {spoken(effect)}"
 
 

@@ -1,0 +1,176 @@
+"""Awkward campaigns, each of which was once answered wrongly, or not answered in part and nothing said."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gyromodel as gm
+from gyromodel.diagnosis._average import average
+from gyromodel.model import ModelError
+from gyromodel.model_files import read_model, write_model
+from gyromodel.signals import rate_output, read_signals
+
+ROWS = 240
+TIME = 10.0 * np.arange(ROWS)
+UNITS = {"segment": "", "time": "s", "temperature": "degC", "output": "deg/h", "rate": "deg/s"}
+
+
+def campaign(
+    output: np.ndarray, time: np.ndarray = TIME, unit: str = "deg/h", kind: str = "rate", **columns: Any
+) -> gm.Campaign:
+    """Columns without a known unit are volts."""
+    units = {name: UNITS.get(name, "V") for name in ("time", *columns)} | {"output": unit}
+    return gm.Campaign({"time": time, **columns, "output": output}, units, {"kind": kind})
+
+
+def fixed(effect: str, parameter: str, value: float, noise: dict[str, float] | None = None) -> gm.GyroModel:
+    """A model of one effect held at a value (internal units)."""
+    model = gm.model_from_effects([effect]).with_vector(jnp.array([value]))
+    return gm.GyroModel(model.effects, noise or {}, frozenset({(effect, parameter)}))
+
+
+def test_rows_without_a_column_are_left_out_and_said_to_be(rng: np.random.Generator) -> None:
+    vibration = rng.normal(size=ROWS)
+    holes = vibration.copy()
+    holes[::7] = np.nan
+    mostly = np.where(np.arange(ROWS) % 2 == 0, vibration, np.nan)
+    output = 5 * vibration + rng.normal(size=ROWS)
+    found = gm.diagnose(campaign(output, vibration=holes, flag=mostly), gm.model_from_effects(["bias"]), hold_out=False)
+    assert [c.effect for c in found.causes] == ["bias_vibration"]
+    assert f"{len(holes[::7])} rows without vibration were left out." in found.findings
+    for name in ("bias_flag", "smooth(flag)"):
+        assert found.not_testable[name] == "flag is missing in 103 of 205 rows"
+
+
+def test_a_sample_alone_between_gaps_has_a_temperature_rate(rng: np.random.Generator) -> None:
+    time = TIME.copy()
+    time[100:] += 2000.0
+    time[101:] += 2000.0
+    temperature = 20 + 1e-3 * time
+    record = read_signals(campaign(rng.normal(size=ROWS), time, temperature=temperature))
+    assert np.asarray(record.signals["temperature_rate"])[:ROWS] == pytest.approx(1e-3, rel=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["increment", "angle"])
+def test_averages_of_increments_and_angles_are_rates(kind: str, rng: np.random.Generator) -> None:
+    """Segments of seven rows, a gap inside one: the mean rate is what it was."""
+    rows = 3000
+    time = 0.01 * np.arange(rows)
+    time[1001:] += 0.03
+    rate = 200.0 + rng.normal(size=rows)
+    steps = np.diff(time, prepend=-0.01)
+    turned = rate * steps if kind == "increment" else np.cumsum(rate * steps)
+    short, together = average(campaign(turned, time, "arcsec", kind, segment=np.arange(rows) // 7), 1500)
+    mean, _ = rate_output(short)
+    assert together == 2
+    assert np.nanmax(np.abs(np.rad2deg(mean) * 3600 - 200.0)) < 6.0
+
+
+def test_what_others_make_needless_is_dropped(rng: np.random.Generator) -> None:
+    u, v = rng.normal(size=(2, ROWS))
+    both = u + v + 0.3 * rng.normal(size=ROWS)
+    found = gm.diagnose(
+        campaign(2 * u + 2 * v + rng.normal(size=ROWS), alpha=u, beta=v, gamma=both),
+        gm.model_from_effects(["bias"]),
+        hold_out=False,
+    )
+    assert sorted(found.extended.model.labels) == ["bias", "bias_alpha", "bias_beta"]
+    assert sorted(c.effect for c in found.causes) == ["bias_alpha", "bias_beta"]
+
+
+def test_a_doubtful_cause_does_not_hide_a_firm_one(rng: np.random.Generator) -> None:
+    walk = np.cumsum(rng.normal(size=ROWS))
+    u = rng.normal(size=ROWS)
+    output = 0.3 * u + 60 * TIME / TIME[-1] + 0.2 * walk + rng.normal(size=ROWS) * 0.1
+    found = gm.diagnose(campaign(output, beta=u), gm.model_from_effects(["bias"]), hold_out=False)
+    assert "bias_beta" in [c.effect for c in found.causes]
+    for label in found.extended.model.labels:
+        assert label == "bias" or label in [c.effect for c in found.causes] or any(label in f for f in found.findings)
+
+
+def test_few_draws_cannot_calibrate(rng: np.random.Generator) -> None:
+    with pytest.raises(ValueError, match="10 draws cannot show a 99 % point"):
+        gm.diagnose(campaign(rng.normal(size=ROWS)), gm.model_from_effects(["bias"]), calibrate=10)
+
+
+def test_a_parameter_fixed_at_a_wrong_value_is_named(rng: np.random.Generator) -> None:
+    found = gm.diagnose(campaign(5 + rng.normal(size=ROWS)), fixed("bias", "value", 0.0), hold_out=False)
+    assert [c.effect for c in found.causes] == ["bias"]
+    assert found.causes[0].parameters[0].value == pytest.approx(5, abs=0.5)
+    assert any("bias is fixed in the simulation" in line for line in found.findings)
+
+
+def test_noise_stated_too_large_lacks_nothing(rng: np.random.Generator) -> None:
+    unit = np.deg2rad(1 / 3600)
+    noise = {"noise_white": unit * np.sqrt(10.0), "noise_random_walk": unit}
+    model = gm.model_from_effects(["bias"])
+    found = gm.diagnose(
+        campaign(rng.normal(size=ROWS)), gm.GyroModel(model.effects, noise, frozenset()), hold_out=False
+    )
+    assert found.verdict == "adequate"
+
+
+def test_a_bias_that_differs_between_campaigns_follows_the_campaign(rng: np.random.Generator) -> None:
+    runs = [campaign(level + rng.normal(size=ROWS)) for level in (0.0, 5.0)]
+    found = gm.diagnose(runs, gm.model_from_effects(["bias"]), hold_out=False)
+    assert found.verdict == "unknown"
+    assert found.driver is not None
+    assert found.driver.column == "campaign"
+    # Steps and lines are not searched across runs, and that is said.
+    assert {"bias_step", "bias_periodic"} <= set(found.not_testable)
+    assert not {"bias_step", "bias_periodic"} & set(found.searched)
+
+
+def test_a_column_may_share_the_name_of_an_effect(rng: np.random.Generator, tmp_path) -> None:
+    drift = rng.normal(size=ROWS)
+    found = gm.diagnose(
+        campaign(5 * drift + rng.normal(size=ROWS), drift=drift), gm.model_from_effects(["bias"]), hold_out=False
+    )
+    assert [c.effect for c in found.causes] == ["bias_column_drift"]
+    write_model(found.extended, tmp_path / "model.yaml")
+    assert read_model(tmp_path / "model.yaml").labels == found.extended.model.labels
+
+
+def test_a_gross_error_in_the_first_row_is_no_firm_step(rng: np.random.Generator) -> None:
+    output = rng.normal(size=ROWS)
+    output[0] += 20.0
+    found = gm.diagnose(campaign(output), gm.model_from_effects(["bias"]), hold_out=False)
+    assert found.verdict != "named"
+
+
+def test_counts_need_a_scale_factor(rng: np.random.Generator) -> None:
+    with pytest.raises(ModelError, match="needs a scale_factor"):
+        gm.fit(campaign(rng.normal(size=ROWS), unit="count/s"), gm.model_from_effects(["bias"]))
+
+
+def test_a_derived_signals_name_is_refused() -> None:
+    with pytest.raises(gm.CampaignError, match="column 'time_on' has the name of a signal that is derived"):
+        campaign(np.arange(ROWS, dtype=float), time_on=TIME)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_nothing_is_left_out_silently(seed: int, rng: np.random.Generator) -> None:
+    """Random mixtures: causes are significant, additions accounted for, columns searched or said not to be."""
+    a, b, c = rng.normal(size=(3, ROWS))
+    temperature = 20 + 10 * np.sin(2 * np.pi * TIME / TIME[-1])
+    size = rng.choice([0.0, 0.5, 2.0], size=4)
+    wrong = (
+        size[0] * a + size[1] * b + size[2] * (temperature - 20) / 5 + size[3] * np.cumsum(rng.normal(size=ROWS)) / 5
+    )
+    found = gm.diagnose(
+        campaign(wrong + rng.normal(size=ROWS), temperature=temperature, a=a, b=b, c=c, d=np.ones(ROWS)),
+        gm.model_from_effects(["bias"]),
+        hold_out=False,
+    )
+    if found.verdict == "named":
+        assert all(cause.statistic >= found.threshold for cause in found.causes)
+    told = " ".join(found.findings)
+    names = {cause.effect for cause in found.causes}
+    assert all(label in names or label in told for label in found.extended.model.labels if label != "bias")
+    for column in "abcd":
+        for name in (f"bias_{column}", f"smooth({column})"):
+            assert name in found.searched or name in found.not_testable
