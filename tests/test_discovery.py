@@ -19,7 +19,7 @@ from tests.truth.verdicts import ACCEPTED
 NULLS = 60
 EFFECTS_1, EFFECTS_3, EFFECTS_10 = 17, 51, 17  # multiples of the 17 effects; at 3 x MDE every effect meets three noises
 UNKNOWN_3, UNKNOWN_10 = 24, 6  # multiples of the 6 uncatalogued effects
-RETRIES = 6  # further draws of an effect that was missed once
+RETRIES = 9  # further draws of an effect that was missed once
 SLOW = ("bias_drift", "bias_step", "bias_warmup")
 WORKERS = 1 if "PYTEST_XDIST_WORKER" in os.environ else 2
 
@@ -48,6 +48,7 @@ def test_accepted_confusions_name_catalogue_effects_and_give_reasons():
         assert known(row.truth)
         assert row.reason
         assert row.stand_ins or row.ambiguous
+        assert all(map(known, row.stand_ins))
 
 
 @pytest.mark.long
@@ -64,8 +65,8 @@ def test_hidden_catalogue_effects_are_named(seed):
     _require(study.effect_levels(records), records, seed)
     assert study.mean_set_size(records) <= 1.5
 
-    # No effect may be one that the engine cannot name: two thirds of nine draws (half, for slow changes in time), by
-    # the binomial law, if the first three were not all right.
+    # No effect may be one that the engine cannot name: if the first three draws were not all right, at least 8 of 12
+    # (5 of 12 for slow changes in time) must be, which is nine tenths (three quarters) loosened by the binomial law.
     third = [r for r in records if r.case.times_mde == 3.0]
     missed = {r.case.effect for r in third if r.score and not r.score.right}
     pool = study.effect_cases(17 * RETRIES, seed + 3, 3.0)
@@ -74,7 +75,7 @@ def test_hidden_catalogue_effects_are_named(seed):
         drawn = [r for r in [*third, *more] if r.case.effect == effect]
         right = sum(r.score.right for r in drawn if r.score)
         # Under flicker or random walk a slow change of bias may not show at all in one run.
-        must = 1 / 2 if effect in SLOW else 2 / 3
+        must = 0.75 if effect in SLOW else 0.9
         level = study.Level("5+", effect, "–", must, True, right, len(drawn))
         assert level.plausible, f"seed {seed}: {effect} right in {right} of {len(drawn)}\n{_told(drawn)}"
 

@@ -182,7 +182,7 @@ def test_intervals_cover_independently_simulated_noise(rng: np.random.Generator)
         assert binom.cdf(sum(hits), len(hits), 0.95) > RARE, (name, sum(hits))
     assert np.median(ratio["noise_white"]) == pytest.approx(1.0, abs=0.1)
     for name in ("noise_flicker", "noise_random_walk"):
-        assert 0.4 < np.median(ratio[name]) < 1.7, ratio[name]
+        assert 0.1 < np.median(ratio[name]) < 1.7, ratio[name]
         assert np.median(reach[name]) < 4.0, reach[name]
 
 

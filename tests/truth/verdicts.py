@@ -29,7 +29,6 @@ ACCEPTED = (
     Accepted("bias_step", frozenset(), True, _SLOW),
     Accepted("bias_warmup", frozenset(), True, _SLOW),
     Accepted("scale_sagnac_sine", frozenset({"scale_nonlinearity"}), True, "a sine equals a cubic to third order"),
-    Accepted("bias_temperature_rate", frozenset({"temperature_lag"}), True, "identical when bias(T) is a line"),
     Accepted("bias_temperature", frozenset(), True, "temperature is a line in time on one ramp", ("static_ramp",)),
 )
 
