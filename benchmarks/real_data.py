@@ -175,7 +175,7 @@ def main(argv: list[str] | None = None) -> None:
         "",
         "## The ladder",
         "",
-        "Errors (mrad/s, at the scale factor) of each soak by the model fitted without it.",
+        "Errors (mrad/s, over the local slope) of each soak by the model fitted without it.",
         "",
         *_ladder(diagnosis),
         "",
