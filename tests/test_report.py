@@ -24,12 +24,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gyromodel.campaign import Campaign
+from gyromodel.declarations import declarations
 from gyromodel.diagnosis._result import Candidate, Cause, Confuser, Diagnosis, Driver, Gain, ParameterValue, Round
 from gyromodel.estimate import Estimate
 from gyromodel.estimate._estimate import ParameterRow
 from gyromodel.report import sentence, with_uncertainty, write_report
 from gyromodel.report._numbers import number, pair, percent, unit_text
 from gyromodel.report._series import bins, explained, thinned
+from gyromodel.report._words import PHRASES
 
 Make = Callable[..., Diagnosis]
 
@@ -47,7 +49,7 @@ class Fitted(Estimate):
 GIVEN = (("scale_factor", "value", 1000.012, 0.031, "count/deg"), ("bias", "value", 1.84, 0.22, "deg/h"))
 SEARCHED = (
     "bias_temperature_rate", "bias_temperature", "bias_temperature_curve", "bias_drift", "bias_step", "bias_periodic",
-    "bias_warmup", "scale_asymmetry", "scale_nonlinearity", "scale_temperature", "scale_sagnac_sine", "lock_in",
+    "bias_warmup", "scale_asymmetry", "scale_nonlinearity", "scale_temperature", "scale_sagnac_sine", "scale_spline",
     "outliers",
 )  # fmt: skip
 DETECTABLE = {
@@ -57,14 +59,14 @@ DETECTABLE = {
     "bias_periodic": (0.8, "deg/h"),
     "scale_asymmetry": (2.3, "ppm"),
     "scale_temperature": (0.12, "ppm/degC"),
-    "lock_in": (2.4e-5, "deg/s"),
+    "scale_spline": (2.4e-5, "deg/s"),
 }
 SHUPE = Cause(
     "bias_temperature_rate",
     (ParameterValue("coefficient", 0.09812, 0.00301, "deg/s/(degC/s)"),),
     statistic=212.4, p_value=1e-40, p_adjusted=2e-39, posterior=0.9996,
     confusers=(
-        Confuser("temperature_lag", 0.02), Confuser("bias_temperature_gradient", 0.31), Confuser("bias_drift", 0.94),
+        Confuser("bias_temperature", 0.02), Confuser("bias_warmup", 0.31), Confuser("bias_drift", 0.94),
     ),
 )  # fmt: skip
 PERIODIC = Cause(
@@ -134,12 +136,8 @@ def made(campaign: Campaign, error: np.ndarray, noise: float, rng: np.random.Gen
         Candidate("smooth(temperature)", 101.3, 2e-9, "driver"),
         Candidate("noise_random_walk", 40.2, 1e-9, "noise"),
         *(Candidate(name, 9.0 - 2.0 * i, 1e-12, "effect") for i, name in enumerate(SEARCHED[1:])),
-        Candidate("none", 0.0, 1e-30, "none"),
     )
-    rest = (
-        Candidate("none", 0.0, 0.93, "none"),
-        *(Candidate(n, -1.0 - i, 0.01, "effect") for i, n in enumerate(SEARCHED)),
-    )
+    rest = (*(Candidate(n, -1.0 - i, 0.01, "effect") for i, n in enumerate(SEARCHED)),)
     fields: dict[str, Any] = {
         "verdict": "named", "causes": (SHUPE,), "driver": None, "gain": gain, "next_test": None,
         "minimum_detectable": DETECTABLE,
@@ -179,7 +177,7 @@ def unchanged(diagnosis: Diagnosis) -> dict[str, Any]:
         log_score_ci95=(0.0, 0.0),
     )
     return {
-        "causes": (), "gain": gain, "rounds": diagnosis.rounds[1:], "credible_set": {"none": 0.93, "lock_in": 0.03},
+        "causes": (), "gain": gain, "rounds": diagnosis.rounds[1:], "credible_set": {},
         "residual_before": after, "residual_after": after, "predicted_before": predicted, "predicted_after": predicted,
         "extended": diagnosis.baseline,
     }  # fmt: skip
@@ -379,6 +377,12 @@ def test_an_ambiguity_keeps_what_is_sure_apart_from_the_set(rng: np.random.Gener
     text = sentence(replace(diagnosis, causes=(SHUPE, *diagnosis.causes)))
     assert text.startswith("Your simulation lacks a temperature-rate bias of (0.0981 ± 0.0030) deg/s per °C/s, and som")
     assert "a bias drift in time or a rate random walk" in text
+
+
+def test_every_effect_of_the_catalogue_has_a_phrase():
+    assert set(declarations()) - {"bias_column"} <= set(PHRASES)
+    spare = set(PHRASES) - set(declarations())
+    assert all(name.startswith(("noise_", "bias_acceleration_")) or name == "outliers" for name in spare)
 
 
 def test_an_effect_outside_the_phrase_list_is_still_named(rng: np.random.Generator):

@@ -15,12 +15,14 @@ import jax
 import numpy as np
 
 from gyromodel import __version__
-from gyromodel.diagnosis._ranking import NEARBY, cells_of_weight, rank, skipped
+from gyromodel.diagnosis._ranking import cells_of_weight, rank, skipped
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.estimate import Estimate, filter_of
 from gyromodel.numerics.state_space import colour
 
 DRAWS_TOGETHER = 64
+# Draws are searched in the noise cells within this many nats of the best on the data: each has noise of its own.
+WITHIN = 12.0
 
 _draw = jax.jit(jax.vmap(colour, in_axes=(None, 0)))
 
@@ -44,7 +46,7 @@ def null_scores(
     skip = skipped(baseline.model)
     cells = [0] if scanner.stated else scanner.only_cells
     if cells is None:
-        cells = cells_of_weight(rank(scanner, scanner.coarse_cells(), baseline, (), skip), NEARBY)
+        cells = cells_of_weight(rank(scanner, scanner.coarse_cells(), baseline, (), skip), WITHIN)
     filter = filter_of(scanner.record, baseline.ratios)
     prior = scanner.grid.log_prior[cells][:, None]
     rng = np.random.default_rng(seed)

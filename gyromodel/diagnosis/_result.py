@@ -53,7 +53,7 @@ class Candidate:
     effect: str
     statistic: float
     posterior: float
-    kind: Literal["effect", "driver", "noise", "none"]
+    kind: Literal["effect", "driver", "noise"]
 
 
 @dataclass(frozen=True)

@@ -137,7 +137,7 @@ def _tiles(diagnosis: Diagnosis) -> list[dict[str, str]]:
         note = f"95 % interval {number(low, 3)} to {number(high, 3)}"
         tiles.append({"label": "Error before ÷ after", "value": f"{number(gain.ratio, 3)}", "note": note})
     best = max((r.statistic for r in diagnosis.rounds if r.added), default=None)
-    top = [c.statistic for r in diagnosis.rounds[:1] for c in r.ranking if c.kind != "none"]
+    top = [c.statistic for r in diagnosis.rounds[:1] for c in r.ranking]
     if best is None and top:
         best = max(top)
     if best is not None:
@@ -194,9 +194,8 @@ def _rankings(diagnosis: Diagnosis) -> list[dict[str, Any]]:
             for c in ranked
         ]
         mark = _bar(diagnosis.threshold, top)
-        more = len(step.ranking) - len(rows)
         added_title = step.added and title(step.added, kind.get(step.added, "effect"))
-        tables.append({"number": index, "added": added_title, "rows": rows, "mark": mark, "more": more})
+        tables.append({"number": index, "added": added_title, "rows": rows, "mark": mark})
     return tables
 
 

@@ -30,7 +30,7 @@ def sentence(diagnosis: Diagnosis) -> str:
 
 
 def kinds(diagnosis: Diagnosis) -> dict[str, str]:
-    """Whether each ranked name is an effect, a noise term, a driver or none."""
+    """Whether each ranked name is an effect, a noise term or a driver."""
     return {candidate.effect: candidate.kind for step in diagnosis.rounds for candidate in step.ranking}
 
 

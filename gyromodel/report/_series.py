@@ -19,26 +19,14 @@ if TYPE_CHECKING:
 POINTS = 3000
 PANELS = 10
 _HOUSEKEEPING = ("run", "position")
-_BY_RATE = ("scale_", "lock_in", "rate_hysteresis", "saturation", "quantisation", "torquer")
-_BY_TIME = ("bias_drift", "bias_step", "bias_warmup", "bias_turn_on", "noise_random_walk", "noise_rate")
+_BY_RATE = ("scale_",)
+_BY_TIME = ("bias_drift", "bias_step", "bias_warmup", "noise_random_walk")
 _BY_NAME = {
     "bias_periodic": "phase",
-    "table_tilt": "azimuth",
-    "table_harmonic": "table_angle",
-    "misalignment": "rate",
-    "temperature_lag": "temperature:rate",
     "bias_temperature_rate": "temperature:rate",
-    "bias_temperature_gradient": "temperature:difference",
     "bias_temperature_curve": "temperature",
-    "bias_thermal_hysteresis": "temperature",
-    "thermometer_error": "temperature",
     "scale_temperature": "temperature:product",
     "scale_temperature_curve": "temperature:product",
-    "scale_drift": "time",
-    "time_delay": "rate:rate",
-    "bandwidth": "rate:rate",
-    "bias_magnetic": "magnetic_field",
-    "bias_readout_code": "feedback_ramp",
 }
 
 
