@@ -26,7 +26,7 @@ from gyromodel.noise import NoiseGrid, NoiseRatios, noise_grid
 from gyromodel.signals import Record, read_signals, with_columns_known
 from gyromodel.units import convertible, factor, from_internal
 
-# ln of the evidence ratio that noise alone exceeds less than once in a hundred campaigns: benchmarks/results/threshold.md.
+# ln of the evidence ratio that noise alone exceeds less than once in a hundred campaigns; see benchmarks/threshold.py.
 SAFE_THRESHOLD = 4.0
 FEWEST_DRAWS = 200
 # Folds search the noise cells within this many nats of the best of the main pass.
