@@ -33,6 +33,9 @@ PHRASES = {
 }
 
 
+_DRIVERS = {"campaign": "the campaign (from run to run)"}
+
+
 def spoken(name: str) -> str:
     """A column or parameter name in words."""
     return re.sub(r"\s+", " ", name.replace("_", " ")).strip()
@@ -41,7 +44,7 @@ def spoken(name: str) -> str:
 def driver_name(text: str) -> str:
     """The columns of a driver in words, from its label such as "smooth(rate, temperature)"."""
     columns = text.removeprefix("smooth(").removesuffix(")") if text.startswith("smooth(") else text
-    return listed([spoken(column) for column in columns.split(",")])
+    return listed([_DRIVERS.get(column.strip(), spoken(column)) for column in columns.split(",")])
 
 
 def phrase(effect: str, kind: str = "effect") -> str:
