@@ -120,6 +120,8 @@ class Campaign:
         """
         if axis not in AXES or f"output_{axis}" not in self.columns:
             raise CampaignError(f"there is no axis '{axis}': the outputs are {listed(self.outputs)}")
+        if reason := _dead(f"output_{axis}", self.columns[f"output_{axis}"]):
+            raise CampaignError(reason)
         renamed = {f"output_{axis}": "output", f"rate_{axis}": "rate"}
         if f"rate_{axis}" in self.columns and "rate" in self.columns:
             raise CampaignError(f"both 'rate' and 'rate_{axis}' are given: keep the one that is about axis {axis}")
@@ -187,6 +189,14 @@ class Campaign:
         object.__setattr__(self, "metadata", MappingProxyType(metadata))
 
 
+def _dead(name: str, values: np.ndarray) -> str:
+    """Why an output measures nothing; empty where it does. One dead axis does not stop the others."""
+    known = values[~np.isnan(values)]
+    if not len(known):
+        return f"column '{name}' has no value: every row is missing"
+    return f"column '{name}' is {known[0]} in every row, so that it measures nothing" if np.ptp(known) == 0 else ""
+
+
 def _restore(columns: Mapping[str, Any], units: Mapping[str, str], metadata: Mapping[str, Any], name: str) -> Campaign:
     campaign = object.__new__(Campaign)
     for key, value in (("columns", columns), ("units", units), ("metadata", metadata), ("name", name)):
@@ -205,13 +215,9 @@ def _check_usable(campaign: Campaign) -> None:
         raise CampaignError(f"give either 'output' or axes, not both: found {listed(outputs)}")
     if len(campaign) < 3:
         raise CampaignError(f"there are {len(campaign)} rows of data, and at least 3 are needed")
-    for name in outputs:
-        values = campaign.columns[name]
-        known = values[~np.isnan(values)]
-        if not len(known):
-            raise CampaignError(f"column '{name}' has no value: every row is missing")
-        if (known == known[0]).all():
-            raise CampaignError(f"column '{name}' is {known[0]} in every row, so that it measures nothing")
+    dead = [reason for name in outputs if (reason := _dead(name, campaign.columns[name]))]
+    if len(dead) == len(outputs):
+        raise CampaignError(dead[0])
     if "kind" not in campaign.metadata:
         name = campaign.outputs[0]
         raise CampaignError(kind_advice(name, campaign.units[name], campaign.columns[name]))

@@ -72,7 +72,7 @@ def test_averages_of_increments_and_angles_are_rates(kind: str, rng: np.random.G
 
 def test_what_others_make_needless_is_dropped(rng: np.random.Generator) -> None:
     u, v = rng.normal(size=(2, ROWS))
-    both = u + v + 0.3 * rng.normal(size=ROWS)
+    both = u + v + rng.normal(size=ROWS)
     found = gm.diagnose(
         campaign(2 * u + 2 * v + rng.normal(size=ROWS), alpha=u, beta=v, gamma=both),
         gm.model_from_effects(["bias"]),

@@ -99,6 +99,10 @@ class BiasWarmup(Effect):
     amplitude: Float[Array, ""] = parameter("deg/h", 1.0, "bias at power-on")
     time_constant: Float[Array, ""] = parameter("s", 600.0, "decay time", linear=False, default=600.0)
 
+    def __check_init__(self) -> None:
+        if self.time_constant <= 0:
+            raise ValueError("a time constant is above zero")
+
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """The decay."""
         return stack(jnp.exp(-signals["time_on"] / self.time_constant))

@@ -49,8 +49,11 @@ def settled(diagnosis: Diagnosis) -> list[Cause]:
 
 
 def _adequate(diagnosis: Diagnosis) -> str:
-    tried = len(diagnosis.searched)
-    count = f": {tried} effects were searched and none stands out from the noise" if tried else ""
+    known = {row.effect for row in diagnosis.baseline.table()}
+    drivers = [name for name in diagnosis.searched if name.startswith("smooth(")]
+    tried = len(set(diagnosis.searched) - known) - len(drivers)
+    smooth = f" and smooth functions of {len(drivers)} drivers" if drivers else ""
+    count = f": {tried} effects{smooth} were searched and none stands out from the noise" if tried else ""
     error = diagnosis.gain.before
     left = ""
     if math.isfinite(error):
