@@ -15,7 +15,7 @@ from gyromodel.signals import Record
 # leading peaks of each pass, whose correction holds for their neighbours too.
 LOWEST_LINES, SPACED_LINES, PEAKS, PEAK_WIDTH = 24, 24, 12, 6
 # Lines closer than this many steps of the grid (a quarter of the resolution each) are one that is not steady.
-RESOLVED = 8
+RESOLVED = 4
 # Fewer cycles in the record than this are a trend, not a line.
 FEWEST_CYCLES = 1.5
 
