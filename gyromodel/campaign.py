@@ -194,7 +194,8 @@ def _dead(name: str, values: np.ndarray) -> str:
     known = values[~np.isnan(values)]
     if not len(known):
         return f"column '{name}' has no value: every row is missing"
-    return f"column '{name}' is {known[0]} in every row, so that it measures nothing" if (known == known[0]).all() else ""
+    constant = (known == known[0]).all()
+    return f"column '{name}' is {known[0]} in every row, so that it measures nothing" if constant else ""
 
 
 def _restore(columns: Mapping[str, Any], units: Mapping[str, str], metadata: Mapping[str, Any], name: str) -> Campaign:
