@@ -335,8 +335,44 @@ def _exchange(
     Returns:
         What stands, its fit, and the rankings beside all but one that speak of it.
     """
+
+    def chosen_again(found: list[Found], estimate: Estimate) -> tuple[list[Found], Estimate, dict[int, Ranking]]:
+        """One pass: each addition exchanged for a better one given all the others."""
+        rankings: dict[int, Ranking] = {}
+        if len(found) < 2:
+            return found, estimate, rankings
+        for i in range(len(found)):
+            if found[i].effect is None or uncontested(found[i]):
+                continue
+            ranking = leave_one_out(record, scanner, baseline, found, i, noise)
+            if ranking is None:
+                continue
+            rankings[i] = ranking
+            others = found[:i] + found[i + 1 :]
+            # Further lines would come on top of the others, not in the place of this one.
+            name, score = ranking.best(drivers=False, but=("bias_periodic",) if _has_lines(others) else ())
+            own = ranking.statistic.get(found[i].name, -np.inf)
+            if (
+                name is None
+                or is_noise(name)
+                or name in (found[i].name, "outliers")
+                or score < max(own + EXCHANGE, threshold)
+            ):
+                continue
+            base = refit(record, baseline, others, noise)
+            if base is None:
+                continue
+            step = _addition(scanner, base, ranking, name, tuple(r for f in others for r in f.rows))
+            changed = [*others[:i], step, *others[i:]]
+            if len(standing(changed)) < len(changed):
+                continue
+            after = refit(record, baseline, changed, noise)
+            if after is not None:
+                found, estimate, rankings = changed, after, {i: ranking}
+        return found, estimate, rankings
+
     while True:
-        found, estimate, rankings = _rechosen(record, scanner, baseline, found, estimate, threshold, noise)
+        found, estimate, rankings = chosen_again(found, estimate)
         own = {i: ranking.statistic.get(found[i].name, -np.inf) for i, ranking in rankings.items()}
         needless = [i for i, v in own.items() if v < (SLOW_LEAD if found[i].name in SLOW_IN_TIME else threshold)]
         if not needless or len(found) < 2:
@@ -347,47 +383,3 @@ def _exchange(
         if after is None:
             return found, estimate, rankings
         found, estimate = fewer, after
-
-
-def _rechosen(
-    record: Record,
-    scanner: Scanner,
-    baseline: Estimate,
-    found: list[Found],
-    estimate: Estimate,
-    threshold: float,
-    noise: NoisePath,
-) -> tuple[list[Found], Estimate, dict[int, Ranking]]:
-    """One pass: each addition exchanged for a better one given all the others."""
-    rankings: dict[int, Ranking] = {}
-    if len(found) < 2:
-        return found, estimate, rankings
-    for i in range(len(found)):
-        if found[i].effect is None or uncontested(found[i]):
-            continue
-        ranking = leave_one_out(record, scanner, baseline, found, i, noise)
-        if ranking is None:
-            continue
-        rankings[i] = ranking
-        others = found[:i] + found[i + 1 :]
-        # Further lines would come on top of the others, not in the place of this one.
-        name, score = ranking.best(drivers=False, but=("bias_periodic",) if _has_lines(others) else ())
-        own = ranking.statistic.get(found[i].name, -np.inf)
-        if (
-            name is None
-            or is_noise(name)
-            or name in (found[i].name, "outliers")
-            or score < max(own + EXCHANGE, threshold)
-        ):
-            continue
-        base = refit(record, baseline, others, noise)
-        if base is None:
-            continue
-        step = _addition(scanner, base, ranking, name, tuple(r for f in others for r in f.rows))
-        changed = [*others[:i], step, *others[i:]]
-        if len(standing(changed)) < len(changed):
-            continue
-        after = refit(record, baseline, changed, noise)
-        if after is not None:
-            found, estimate, rankings = changed, after, {i: ranking}
-    return found, estimate, rankings
