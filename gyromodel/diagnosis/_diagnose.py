@@ -18,8 +18,9 @@ from gyromodel.diagnosis._ranking import Ranking, cells_of_weight, is_driver, is
 from gyromodel.diagnosis._result import Candidate, Diagnosis, Gain, Round
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import Found, NoisePath, Progress, Selection, search, standing
+from gyromodel.diagnosis._shapes import driver_shape, minimum_detectable, not_testable
 from gyromodel.diagnosis._variance import growing_noise, noise_level, tails, with_variance
-from gyromodel.diagnosis._verdict import driver_shape, judge, minimum_detectable, not_testable
+from gyromodel.diagnosis._verdict import judge
 from gyromodel.estimate import Estimate, EstimateError, check_covariates, fit_record, with_noise_intervals
 from gyromodel.model import GyroModel, record_span
 from gyromodel.noise import NoiseGrid, NoiseRatios, noise_grid

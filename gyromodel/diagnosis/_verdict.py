@@ -5,29 +5,26 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import comb
 
-import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
 from gyromodel.diagnosis._bank import smooth_columns
-from gyromodel.diagnosis._evidence import explained_for
-from gyromodel.diagnosis._ranking import Ranking, is_driver, skipped
-from gyromodel.diagnosis._result import Cause, Confuser, Driver, ParameterValue, Verdict
+from gyromodel.diagnosis._ranking import Ranking, is_driver
+from gyromodel.diagnosis._result import Cause, Confuser, ParameterValue, Verdict
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import (
     SLOW_IN_TIME,
     TIME_MARGIN,
     Found,
     Selection,
-    form_effect,
     leave_one_out,
     uncontested,
 )
-from gyromodel.effects import Effect
+from gyromodel.diagnosis._shapes import remaining, separation
 from gyromodel.estimate import Estimate
-from gyromodel.model import GyroModel, effect_class, parameter_unit
+from gyromodel.model import effect_class
 from gyromodel.signals import Record
-from gyromodel.units import factor, from_internal, internal_unit
+from gyromodel.units import factor
 
 # Share of the posterior that the credible set holds.
 CREDIBLE = 0.95
@@ -131,7 +128,7 @@ def judge(
             f"More remains than was named: {selection.remains} is still significant (ln B = "
             f"{selection.last.statistic.get(selection.remains, np.nan):.0f}) and was not added."
         )
-    driver, share = _remaining(scanner, baseline, selection)
+    driver, share = remaining(scanner, baseline, selection)
     unexplained = {" and ".join(smooth_columns(driver)): share} if driver else {}
     if driver and (not causes or share > UNKNOWN_SHARE):
         column = smooth_columns(driver)
@@ -239,7 +236,7 @@ def _cause(
     if len(null_scores):
         adjusted = float((1 + np.sum(null_scores >= statistic)) / (1 + len(null_scores)))
     rivals = sorted((k for k in ranking.statistic if k != name), key=lambda k: -ranking.statistic[k])[:4]
-    confusers = tuple(Confuser(k, s) for k in rivals if (s := _separation(scanner, ranking, name, k)) is not None)
+    confusers = tuple(Confuser(k, s) for k in rivals if (s := separation(scanner, ranking, name, k)) is not None)
     if step.rows:
         parameters = _point_parameters(scanner.record, estimate, step.rows)
         if "scale_spline" in members:
@@ -268,140 +265,3 @@ def _point_parameters(record: Record, estimate: Estimate, rows: tuple[int, ...])
         label = f"shift at {rate:.4g} deg/s" if rate is not None else f"shift at data row {r + 1}"
         found.append(ParameterValue(label, shift * scale, std * scale, "deg/s"))
     return tuple(found)
-
-
-def _columns(scanner: Scanner, ranking: Ranking, name: str) -> np.ndarray | None:
-    if name not in ranking.results[ranking.best_cell(name)].best:
-        return None
-    form, _, _ = ranking.best_form(name)
-    if name == "outliers":
-        rows = form if isinstance(form, tuple) else (form,)
-        marks = np.zeros((len(scanner.present), len(rows)))
-        marks[list(rows), np.arange(len(rows))] = 1.0
-        return marks
-    assert isinstance(form, int)
-    effect = form_effect(scanner, name, form)
-    if name in ("bias_step", "bias_periodic"):
-        assert effect is not None
-        return np.asarray(effect.columns(scanner.record.signals))
-    block = scanner.bank.blocks[form]
-    return scanner.bank.columns[:, block.start : block.start + block.width]
-
-
-def _separation(scanner: Scanner, ranking: Ranking, a: str, b: str) -> float | None:
-    """Sine of the smallest angle between two candidates' whitened, projected columns, in the noise of the first."""
-    first, second = _columns(scanner, ranking, a), _columns(scanner, ranking, b)
-    if first is None or second is None:
-        return None
-    g = ranking.best_cell(a)
-    w = scanner.cells.whiten(g, jnp.asarray(np.concatenate([ranking.baseline_columns, first, second], axis=1)))
-    p = ranking.baseline_columns.shape[1]
-    base = w[:, :p] / np.maximum(np.linalg.norm(w[:, :p], axis=0), 1e-300)
-    rest = w[:, p:] - base @ np.linalg.lstsq(base, w[:, p:], rcond=1e-10)[0]
-    qa, qb = (_basis(x) for x in (rest[:, : first.shape[1]], rest[:, first.shape[1] :]))
-    if not qa.shape[1] or not qb.shape[1]:
-        return None
-    # The smaller space measured against the larger one.
-    cosine = np.linalg.svd(qa.T @ qb, compute_uv=False)
-    return float(np.sqrt(max(0.0, 1.0 - min(1.0, cosine[: min(qa.shape[1], qb.shape[1])].max()) ** 2)))
-
-
-def _basis(x: np.ndarray) -> np.ndarray:
-    u, s, _ = np.linalg.svd(x / np.maximum(np.linalg.norm(x, axis=0), 1e-300), full_matrices=False)
-    return u[:, s > 1e-5]
-
-
-def _remaining(scanner: Scanner, baseline: Estimate, selection: Selection) -> tuple[str | None, float]:
-    """The driver that is still significant, and its share of all the structure that names and driver explain."""
-    driver = selection.driver
-    if driver is None:
-        return None, 0.0
-    g = selection.last.best_cell(driver)
-    left = selection.last.best_form(driver)[1]
-    record = scanner.record
-    residuals = []
-    for estimate in (baseline, selection.estimate):
-        predicted, jacobian = estimate.model.linearise(record.signals)
-        gain = float(estimate.model.gain())
-        y = jnp.where(record.sampling.present, record.signals["output"] - predicted, 0.0) / gain
-        marks = np.zeros((len(scanner.present), 0))
-        rows = [r for f in selection.found for r in f.rows]
-        if rows:
-            marks = np.zeros((len(scanner.present), len(rows)))
-            marks[rows, np.arange(len(rows))] = 1.0
-        w = scanner.cells.whiten(g, jnp.column_stack([jacobian, jnp.asarray(marks), y]))
-        base = w[:, :-1] / np.maximum(np.linalg.norm(w[:, :-1], axis=0), 1e-300)
-        residuals.append(float(np.sum((w[:, -1] - base @ np.linalg.lstsq(base, w[:, -1], rcond=1e-10)[0]) ** 2)))
-    named = max(residuals[0] - residuals[1], 0.0)
-    return driver, left / (left + named)
-
-
-def driver_shape(scanner: Scanner, selection: Selection, name: str, unit: str) -> Driver:
-    """The smooth function behind an unknown discrepancy and its band, at the measured points by its first column."""
-    ranking = selection.last
-    columns = _columns(scanner, ranking, name)
-    assert columns is not None
-    record, estimate = scanner.record, selection.estimate
-    predicted, jacobian = estimate.model.linearise(record.signals)
-    gain = float(estimate.model.gain())
-    y = jnp.where(record.sampling.present, record.signals["output"] - predicted, 0.0) / gain
-    g = ranking.best_cell(name)
-    w = scanner.cells.whiten(g, jnp.column_stack([jacobian / gain, jnp.asarray(columns), y]))
-    p = jacobian.shape[1]
-    norm = np.maximum(np.linalg.norm(w[:, :-1], axis=0), 1e-300)
-    u, s, vt = np.linalg.svd(w[:, :-1] / norm, full_matrices=False)
-    keep = s > 1e-5 * s[0]
-    inverse = vt[keep].T / s[keep]
-    solution = inverse @ (u[:, keep].T @ w[:, -1])
-    variance = float(np.sum((w[:, -1] - w[:, :-1] @ (solution / norm)) ** 2)) / max(scanner.degrees_of_freedom - p, 1)
-    covariance = inverse @ inverse.T * variance
-    shape = columns[: record.rows] / norm[p:]
-    shape = shape - shape.mean(0)
-    value = shape @ solution[p:]
-    std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", shape, covariance[p:, p:], shape), 0.0))
-    column = smooth_columns(name)[0]
-    file_unit = record.units.get(column, "s")
-    x = np.asarray(record.signals[column])[: record.rows]
-    order = np.argsort(x)[:: max(1, record.rows // 300)]
-    scale = factor("rad/s", unit)
-    label = " and ".join(smooth_columns(name))
-    return Driver(label, file_unit, from_internal(x[order], file_unit), value[order] * scale, std[order] * scale, unit)
-
-
-def minimum_detectable(scanner: Scanner, ranking: Ranking, threshold: float, unit: str) -> dict[str, tuple[float, str]]:
-    """Size of each searched effect that would have been found with 80 % probability, at the noise of the final fit."""
-    g = ranking.best_cell()
-    result = ranking.results[g]
-    nu = scanner.degrees_of_freedom - ranking.baseline_columns.shape[1]
-    sigma = np.sqrt(result.rss / nu)
-    sizes: dict[str, tuple[float, str]] = {}
-    widths = {b.name: b for b in reversed(scanner.bank.blocks)}
-    for name, energy in result.energy.items():
-        energy = energy[energy > 0]
-        if is_driver(name) or name == "outliers" or not len(energy):
-            continue
-        q = widths[name].width if name in widths else (2 if name == "bias_periodic" else 1)
-        needed = np.sqrt(explained_for(threshold + np.log(len(energy)), nu, q)) + 0.84
-        size = float(needed * sigma / np.sqrt(np.median(energy)))
-        sizes[name] = _in_unit(scanner, name, widths[name].effect if name in widths else None, q, size, unit)
-    return sizes
-
-
-def _in_unit(scanner: Scanner, name: str, effect: Effect | None, q: int, size: float, unit: str) -> tuple[float, str]:
-    effect = effect if effect is not None else form_effect(scanner, name, 1)
-    assert effect is not None
-    if effect.site == "gain":
-        return size / factor("ppm", "1"), "ppm"
-    field = next(k for k, d in effect.declared().items() if d.linear)
-    declared = parameter_unit(effect, field, scanner.record.output_unit, scanner.record.units)
-    return size * factor(internal_unit(declared), declared), declared
-
-
-def not_testable(scanner: Scanner, ranking: Ranking, model: GyroModel) -> dict[str, str]:
-    """Candidates that a model does not have and whose columns vanish beside it, with the reason."""
-    result = ranking.results[ranking.best_cell()]
-    return {
-        name: "cannot be told from what the model already has on this campaign"
-        for name in {b.name for b in scanner.bank.blocks if b.kind == "effect"} - skipped(model)
-        if name not in result.evidence and not (result.energy.get(name, np.zeros(1)) > 0).any()
-    }
