@@ -29,6 +29,12 @@ from gyromodel.signals import read_signals
 ROWS = 256
 
 
+@pytest.fixture
+def seed() -> int:
+    """One draw, the same in each run: a verdict errs as often as its threshold allows, which test_discovery measures."""
+    return 1
+
+
 def static_log(rng: np.random.Generator, wrong: np.ndarray | float = 0.0, unit: str = "deg/h") -> gm.Campaign:
     """A static thermal log of 256 rows with white noise of 1 deg/h."""
     time = 20.0 * np.arange(ROWS)

@@ -115,7 +115,7 @@ def rank(
         level = [float(kind[g]) * everything[g].rss / everything[cells[0]].rss for g in family]
         more = [everything[g].log_likelihood for g, v in zip(family, level, strict=True) if v > float(kind[0])]
         if more:
-            statistic[name] = log_sum(more) - np.log(len(family)) - within_stated
+            statistic[name] = float(log_sum(more) - np.log(len(family)) - within_stated)
     total = log_sum(list(statistic.values())) if statistic else 0.0
     posterior = {k: float(np.exp(v - total)) for k, v in statistic.items()}
     walk, flicker = scanner.grid.ratios.walk, scanner.grid.ratios.flicker
