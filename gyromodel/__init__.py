@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from gyromodel.effects import Effect as Effect
     from gyromodel.estimate import Estimate as Estimate
     from gyromodel.estimate import fit as fit
+    from gyromodel.estimate import fit_function as fit_function
     from gyromodel.estimate import two_stage as two_stage
     from gyromodel.files import read_campaign as read_campaign
     from gyromodel.files import write_campaign as write_campaign
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from gyromodel.model import simulate as simulate
     from gyromodel.model_files import read_model as read_model
     from gyromodel.model_files import write_model as write_model
+    from gyromodel.numerics.uncertain import Uncertain as Uncertain
+    from gyromodel.numerics.uncertain import together as together
     from gyromodel.report import write_report as write_report
     from gyromodel.units import UnitError as UnitError
 
@@ -41,13 +44,16 @@ _MODULE_OF = {
     "Effect": "effects",
     "Estimate": "estimate",
     "GyroModel": "model",
+    "Uncertain": "numerics.uncertain",
     "UnitError": "units",
     "diagnose": "diagnosis",
     "fit": "estimate",
+    "fit_function": "estimate",
     "model_from_effects": "model",
     "read_campaign": "files",
     "read_model": "model_files",
     "simulate": "model",
+    "together": "numerics.uncertain",
     "two_stage": "estimate",
     "write_campaign": "files",
     "write_model": "model_files",

@@ -131,8 +131,7 @@ def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
         columns["time"] = time - time[0]
         columns["time_on"] = columns["time"] + _power_on(campaign)
         if "temperature" in columns:
-            stretch = _stretches(time)
-            columns["temperature_rate"] = _thermometer_rate(time, columns["temperature"], stretch)
+            columns["temperature_rate"] = _thermometer_rate(time, columns["temperature"])
         if len(campaigns) > 1 and "campaign" not in names:
             columns["campaign"] = np.full(len(time), 1.0 + len(blocks))
         columns["output"] = output
@@ -173,8 +172,16 @@ def _power_on(campaign: Campaign) -> float:
     return float(value)
 
 
-def _thermometer_rate(time: np.ndarray, temperature: np.ndarray, stretch: np.ndarray) -> np.ndarray:
+def thermometer_rate(record: Record, temperature: np.ndarray) -> np.ndarray:
+    """The signal temperature_rate that a record would have with another temperature, one value a row."""
+    time = np.asarray(record.signals["time"])[: record.rows]
+    runs = np.cumsum(np.asarray(record.sampling.restart)[: record.rows])
+    return np.concatenate([_thermometer_rate(time[runs == i], temperature[runs == i]) for i in np.unique(runs)])
+
+
+def _thermometer_rate(time: np.ndarray, temperature: np.ndarray) -> np.ndarray:
     """dT/dt of the smoothed thermometer, each stretch by itself; a sample alone takes the slope to its neighbours."""
+    stretch = _stretches(time)
     good = np.isfinite(temperature)
     rate = np.full(len(time), np.nan)
     if good.sum() < 2:

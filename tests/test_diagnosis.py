@@ -31,7 +31,7 @@ ROWS = 256
 
 @pytest.fixture
 def seed() -> int:
-    """One draw, the same in each run: a verdict errs as often as its threshold allows, which test_discovery measures."""
+    """One draw, the same in each run: verdicts err as often as the threshold allows, which test_discovery measures."""
     return 1
 
 

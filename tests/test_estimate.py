@@ -200,7 +200,8 @@ def test_propagation_is_the_derivative_by_hand_and_the_spread_of_draws(nonlinear
         warmup = model.effects[4]
         return warmup.amplitude * jnp.exp(-600.0 / warmup.time_constant)  # type: ignore[attr-defined]
 
-    value, variance = nonlinear.propagate(at_ten_minutes)
+    later = nonlinear.propagate(at_ten_minutes)
+    value, variance = later.value, later.covariance
     decay = np.exp(-600.0 / float(tau))
     assert float(value) == pytest.approx(float(amplitude) * decay)
     by_hand = np.array([0, 0, 0, 0, decay, float(amplitude) * decay * 600 / float(tau) ** 2])
@@ -211,7 +212,8 @@ def test_propagation_is_the_derivative_by_hand_and_the_spread_of_draws(nonlinear
     spread = np.var(a * np.exp(-600.0 / t)) / 0.1**2
     assert spread == pytest.approx(float(variance[0, 0]), rel=0.06)  # 1 % of statistics, the rest for curvature
 
-    values, matrix = nonlinear.propagate(lambda m: m.predict(nonlinear.record.signals)[:5])
+    first = nonlinear.propagate(lambda m: m.predict(nonlinear.record.signals)[:5])
+    values, matrix = first.value, first.covariance
     assert values.shape == (5,)
     assert matrix.shape == (5, 5)
     jacobian = np.asarray(nonlinear.model.linearise(nonlinear.record.signals)[1])[:5]

@@ -10,14 +10,17 @@ from gyromodel.estimate._fit import (
     whiten_columns,
     with_noise_intervals,
 )
+from gyromodel.estimate._function import FunctionFit, fit_function
 from gyromodel.estimate._two_stage import two_stage
 
 __all__ = [
     "Estimate",
     "EstimateError",
+    "FunctionFit",
     "check_covariates",
     "filter_of",
     "fit",
+    "fit_function",
     "fit_record",
     "make_filter",
     "two_stage",

@@ -6,13 +6,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from gyromodel.model import GyroModel, parameter_unit
 from gyromodel.noise import NOISE_UNITS, NoiseRatios, coefficients
+from gyromodel.numerics.uncertain import Source, Uncertain, factor_of
 from gyromodel.signals import Record
 from gyromodel.units import factor, internal_unit
 
@@ -46,6 +44,8 @@ class Estimate:
         noise_interval: 95 % interval of each noise coefficient, internal rate units.
         log_likelihood: restricted, at the estimate.
         noise_given: whether the model stated its noise.
+        source: the scatter of this fit's own data, as a source of error.
+        inherited: what earlier fits' errors change in the parameters, by source (see `two_stage`).
         ordinary: whether the parameters weigh all samples alike (see `fit_record`).
     """
 
@@ -62,11 +62,24 @@ class Estimate:
     noise_given: bool = False
     ordinary: bool = False
     noise_interval: Mapping[str, tuple[float, float]] = field(default_factory=dict, repr=False)
+    source: Source = field(default_factory=lambda: Source("campaign"), repr=False)
+    inherited: Mapping[Source, np.ndarray] = field(default_factory=dict, repr=False)
 
     @property
     def std(self) -> np.ndarray:
         """Standard uncertainties, in the order of `model.slots()`, internal units."""
         return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def own_covariance(self) -> np.ndarray:
+        """The part of the covariance that the scatter of this fit's own data causes."""
+        return self.covariance - sum((a @ a.T for a in self.inherited.values()), np.zeros_like(self.covariance))
+
+    @property
+    def parameters(self) -> Uncertain:
+        """The fitted model as an uncertain value, with the sources of its error."""
+        sources = {self.source: factor_of(self.own_covariance), **self.inherited}
+        return Uncertain(np.asarray(self.model.vector()), self.model.with_vector, sources)
 
     def model_as_given(self) -> GyroModel:
         """The fitted model with its noise to be estimated again, unless it was stated."""
@@ -99,22 +112,9 @@ class Estimate:
             rows[name] = {"value": value * scale, "lo": low * scale, "hi": high * scale, "unit": unit}
         return rows
 
-    def propagate(self, function: Callable[[GyroModel], Float[Array, "*out"]]) -> tuple[np.ndarray, np.ndarray]:
-        """A differentiable function of the model with its covariance, to first order.
-
-        Args:
-            function: maps a model to an array.
-
-        Returns:
-            The value and the covariance of its flattened entries.
-        """
-        x = self.model.vector()
-
-        def of_vector(v):
-            return jnp.ravel(jnp.asarray(function(self.model.with_vector(v))))
-
-        jacobian = np.asarray(jax.jacfwd(of_vector)(x))
-        return np.asarray(function(self.model)), jacobian @ self.covariance @ jacobian.T
+    def propagate(self, function: Callable[[GyroModel], Any]) -> Uncertain:
+        """A differentiable function of the model (to any tree of arrays) with its uncertainty, to first order."""
+        return self.parameters.propagate(function)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready summary."""

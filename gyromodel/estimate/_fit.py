@@ -17,6 +17,7 @@ from gyromodel.model import GyroModel, ModelError, check_units, record_span
 from gyromodel.noise import NoiseRatios, from_grams, markov_sum, noise_grid, restricted_likelihood
 from gyromodel.numerics.least_squares import Normal, Solution, levenberg_marquardt
 from gyromodel.numerics.state_space import Filter, build_filter, colour, whiten, whitened_gram
+from gyromodel.numerics.uncertain import Source
 from gyromodel.signals import Record, read_signals
 
 Solver = Literal["levenberg_marquardt", "optimistix"]
@@ -38,6 +39,7 @@ def fit(
     *,
     solver: Solver = "levenberg_marquardt",
     progress: Progress = None,
+    name: str = "campaign",
 ) -> Estimate:
     """Fit all free parameters of a model to one unit's campaigns together.
 
@@ -46,6 +48,7 @@ def fit(
         model: what to fit; `noise` empty estimates white noise, flicker and random walk alongside.
         solver: the package's own solver, or optimistix's.
         progress: called with a line and the fraction done.
+        name: what these data are called where their part in a later result's uncertainty is told.
 
     Raises:
         EstimateError: the campaign does not determine some combination of parameters, or the fit did not converge.
@@ -55,6 +58,7 @@ def fit(
     if progress:
         progress("fitting", 0.1)
     estimate = with_noise_intervals(fit_record(record, model, solver=solver))
+    estimate = replace(estimate, source=Source(name, float(estimate.degrees_of_freedom)))
     if progress:
         progress("fitted", 1.0)
     return estimate

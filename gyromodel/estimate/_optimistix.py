@@ -6,12 +6,15 @@ uncertainty of parameters that were held fixed reaches the fitted ones.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optimistix as optx
+from jaxtyping import Float
 
 from gyromodel.model import GyroModel
 from gyromodel.numerics.least_squares import Solution
@@ -33,30 +36,42 @@ def optimistix_solution(model: GyroModel, x, signals, filter: Filter) -> Solutio
     return Solution(np.asarray(x), float(now), steps, bool(done))
 
 
-def response_to_held(model: GyroModel, held: GyroModel, signals, filter: Filter) -> np.ndarray:
-    """Derivative of the fitted parameters by parameters that the fit held fixed.
+def response_to_changes(
+    model: GyroModel,
+    held: GyroModel | None,
+    changes: Float[np.ndarray, "held error"],
+    signals,
+    signal_changes: Mapping[str, Float[np.ndarray, "sample error"]],
+    filter: Filter,
+) -> Float[np.ndarray, "parameter error"]:
+    """Change of the fitted parameters with parameters that the fit held fixed and with the signals it saw.
 
     Args:
         model: at the estimate.
-        held: the same model with exactly those parameters free that are to vary.
+        held: the same model with exactly those parameters free that change; None where none does.
+        changes: of these parameters, one column an error.
         signals: the data.
+        signal_changes: of some of the signals, one column an error.
         filter: the noise that the fit was weighted with.
 
     Returns:
-        One row a fitted parameter, one column a held one, internal units.
+        One row a fitted parameter, one column an error, internal units.
     """
-    return np.asarray(_response(model, held, signals, filter))
+    moved = {name: jnp.asarray(change) for name, change in signal_changes.items()}
+    return np.asarray(_response(model, held, jnp.asarray(changes), signals, moved, filter))
 
 
 @eqx.filter_jit
-def _response(model: GyroModel, held: GyroModel, signals, filter: Filter):
+def _response(model: GyroModel, held: GyroModel | None, changes, signals, signal_changes, filter: Filter):
     x = model.vector()
 
-    def refitted(values):
-        moved = GyroModel(held.with_vector(values).effects, model.noise, model.fixed, model.gyro)
-        return _solve(moved, x, signals, filter)[0]
+    def refitted(errors):
+        effects = model.effects if held is None else held.with_vector(held.vector() + changes @ errors).effects
+        moved = GyroModel(effects, model.noise, model.fixed, model.gyro)
+        seen = {**signals, **{name: signals[name] + change @ errors for name, change in signal_changes.items()}}
+        return _solve(moved, x, seen, filter)[0]
 
-    return jax.jacfwd(refitted)(held.vector())
+    return jax.jacfwd(refitted)(jnp.zeros(changes.shape[1]))
 
 
 @eqx.filter_jit
