@@ -30,6 +30,8 @@ RUNAWAY = 1e8
 # Gauss-Newton steps by QR after the normal equations, which have lost half of the digits.
 POLISH = 20
 MAXIMUM_ITERATIONS = 500
+# Without scaling more are needed, and cheap: they are compiled in one loop.
+UNSCALED_ITERATIONS = 10_000
 # Rounds of the residual scales of groups, and the relative change that ends them.
 SCALE_ROUNDS, SCALE_CLOSE = 50, 1e-6
 # A minimum whose sum of squares is this improbable, the errors being known, is a false one until other starts agree.
@@ -220,7 +222,7 @@ def _unscaled(start, measured, weight, *arguments):
         return jnp.concatenate([(_predict(x, *arguments) - measured) * weight, x[width:]])
 
     solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-10)
-    found = optx.least_squares(residual, solver, start, max_steps=4 * MAXIMUM_ITERATIONS, throw=False)
+    found = optx.least_squares(residual, solver, start, max_steps=UNSCALED_ITERATIONS, throw=False)
     return found.value, found.stats["num_steps"], found.result == optx.RESULTS.successful
 
 
