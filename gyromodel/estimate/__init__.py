@@ -1,5 +1,6 @@
 """Joint generalised least squares with the noise estimated alongside; estimates carry their covariance."""
 
+from gyromodel.estimate._calibration import Calibration
 from gyromodel.estimate._estimate import Estimate, EstimateError
 from gyromodel.estimate._fit import (
     check_covariates,
@@ -13,6 +14,7 @@ from gyromodel.estimate._fit import (
 from gyromodel.estimate._two_stage import two_stage
 
 __all__ = [
+    "Calibration",
     "Estimate",
     "EstimateError",
     "check_covariates",
