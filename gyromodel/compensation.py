@@ -79,7 +79,9 @@ def _estimate(calibration: Calibration, record: Record) -> tuple[np.ndarray, np.
     return rate, variance if known else np.full_like(variance, np.nan)
 
 
-def _notes(campaign: Campaign, calibration: Calibration, record: Record, rate: np.ndarray, std: np.ndarray) -> list[str]:
+def _notes(
+    campaign: Campaign, calibration: Calibration, record: Record, rate: np.ndarray, std: np.ndarray
+) -> list[str]:
     """What a user of the estimated rate must know, a sentence each."""
     model, present, notes = calibration.model, record.present, []
     if lost := int((present & np.isnan(rate)).sum()):
@@ -129,9 +131,7 @@ def _solve(
     return rate, variance
 
 
-def output_and_slope(
-    model: GyroModel, signals: Signals
-) -> tuple[Float[Array, " sample"], Float[Array, " sample"]]:
+def output_and_slope(model: GyroModel, signals: Signals) -> tuple[Float[Array, " sample"], Float[Array, " sample"]]:
     """The model's output, and its derivative by the rate of the same sample."""
     rate = signals["rate"]
     return jax.jvp(lambda r: model.predict({**signals, "rate": r}), (rate,), (jnp.ones_like(rate),))

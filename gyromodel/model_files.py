@@ -138,7 +138,9 @@ def read_calibration(path: str | Path) -> Calibration:
 def _read_covariance(place: _Place, names: list[str]) -> np.ndarray:
     found = place.mapping(("parameters", "unit", "matrix"), "a covariance", complete=True)
     if [item.text() for item in found["parameters"].items("parameters")] != names:
-        raise found["parameters"].error("the covariance is not that of the model's free parameters; fit the model again")
+        raise found["parameters"].error(
+            "the covariance is not that of the model's free parameters; fit the model again"
+        )
     rows = [row.items("a row of the matrix") for row in found["matrix"].items("the matrix")]
     if any(len(row) != len(names) for row in [rows, *rows]):
         raise found["matrix"].error(f"the matrix needs {len(names)} rows of as many numbers")

@@ -64,7 +64,7 @@ class Estimate:
         return self.model if self.noise_given else GyroModel(self.model.effects, {}, self.model.fixed, self.model.gyro)
 
     def calibration(self) -> Calibration:
-        """What it takes to use the fit elsewhere: the model with its units, the covariance, the ranges it was fitted over.
+        """What it takes to use the fit elsewhere: the model with its units, the covariance, and the ranges it has seen.
 
         `write_model` keeps it in the model file, and `read_calibration` reads it.
         """
