@@ -25,10 +25,12 @@ from gyromodel.units import from_internal
 TOLERANCE = 1e-9
 # Newton needs 3 to 6 steps; next to a fold or a jump of the model, halving takes up to 60.
 MOST_STEPS = 64
+# Rates between rest and the answer at which the output must rise, or the answer lies on another branch.
+WAYPOINTS = 8
 # Samples solved together: what a million of them need stays in cache, and only their own slowest holds them up.
 BLOCK = 1 << 15
-# Rates count as outside the calibration only beyond their own uncertainty.
-SURELY = 3.0
+# A rate lies outside the calibration beyond this many of its standard uncertainties: of a million noisy ones, none by chance.
+SURELY = 6.0
 # Ranges in files are rounded to ten digits.
 ROUNDING = 1e-9
 
@@ -37,10 +39,11 @@ def compensate(campaign: Campaign, calibration: Calibration) -> Campaign:
     """The campaign with its input rate estimated from the output and the covariates.
 
     Adds `rate_estimated` and its standard uncertainty `rate_estimated_std` (deg/s). The uncertainty holds the
-    covariance of the fitted parameters and the white noise of one sample; not flicker and random walk, nor that of
-    parameters held fixed. A sample is NaN where the output is missing, or where the model gives this output at no rate
-    on the branch through rest. What a user must know (such samples, those outside the calibrated ranges, what the
-    uncertainty lacks) is said in the metadata `rate_estimated_note`. A column `rate` is not needed and not used.
+    covariance of the fitted parameters and the white noise of one sample, as far as the calibration knows them
+    (metadata `rate_estimated_std_holds`); not flicker and random walk, nor that of parameters held fixed. Both columns
+    are NaN where the output is missing, or where the model gives it at no rate on the branch through rest. Such
+    samples, those outside the calibrated ranges and what else a user must know are counted in the metadata
+    `rate_estimated_note`. A column `rate` is not needed and not used.
 
     Args:
         campaign: one axis, with the covariates that the model needs.
@@ -59,7 +62,16 @@ def compensate(campaign: Campaign, calibration: Calibration) -> Campaign:
     notes = _notes(campaign, calibration, record, rate, np.sqrt(variance))
     campaign = campaign.with_column("rate_estimated", from_internal(rate, "deg/s"), "deg/s")
     campaign = campaign.with_column("rate_estimated_std", from_internal(np.sqrt(variance), "deg/s"), "deg/s")
-    return campaign.with_metadata({"rate_estimated_note": " ".join(notes)}) if notes else campaign
+    return campaign.with_metadata({
+        "rate_estimated_std_holds": ", ".join(_held(calibration)) or "nothing",
+        "rate_estimated_note": " ".join(notes) or None,
+    })  # fmt: skip
+
+
+def _held(calibration: Calibration) -> list[str]:
+    """What the standard uncertainty is made of."""
+    fitted = calibration.covariance is not None
+    return ["parameter covariance"] * fitted + ["white noise of one sample"] * bool(calibration.model.noise)
 
 
 def _estimate(calibration: Calibration, record: Record) -> tuple[np.ndarray, np.ndarray]:
@@ -75,8 +87,7 @@ def _estimate(calibration: Calibration, record: Record) -> tuple[np.ndarray, np.
         part = {name: _block(values, start) for name, values in signals.items()}
         parts.append(_solve(model, jnp.asarray(spread), white, part, _block(output, start)))
     rate, variance = (np.concatenate(found)[: record.rows] for found in zip(*parts, strict=True))
-    known = covariance is not None or model.noise or not model.slots()
-    return rate, variance if known else np.full_like(variance, np.nan)
+    return rate, variance if _held(calibration) else np.full_like(variance, np.nan)
 
 
 def _notes(
@@ -108,7 +119,7 @@ def _notes(
     return notes
 
 
-def _block(values: Float[Array, " sample"], start: int) -> Float[Array, " sample"]:
+def _block(values: Float[Array, " sample"], start: int) -> Float[Array, " block"]:
     """A block of a long record, the last one filled up; a short record whole."""
     block = values[start : start + BLOCK]
     return block if len(values) <= BLOCK else jnp.pad(block, (0, BLOCK - len(block)), mode="edge")
@@ -128,7 +139,7 @@ def _solve(
     # Implicit function theorem: ∂rate/∂parameter = −(∂output/∂parameter)/(∂output/∂rate).
     jacobian = model.linearise(signals)[1] / slope[:, None]
     variance = jnp.sum((jacobian @ covariance) * jacobian, axis=1) + white * (model.gain() / slope) ** 2
-    return rate, variance
+    return rate, jnp.where(jnp.isfinite(rate), variance, jnp.nan)
 
 
 def output_and_slope(model: GyroModel, signals: Signals) -> tuple[Float[Array, " sample"], Float[Array, " sample"]]:
@@ -198,4 +209,9 @@ def invert(model: GyroModel, signals: Signals, output: Float[Array, " sample"]) 
         jnp.isfinite(target), jnp.zeros((), int),
     )  # fmt: skip
     end = jax.lax.while_loop(lambda s: jnp.any(s.running) & (s.steps < MOST_STEPS), advance, start)
-    return jnp.where(end.found, end.rate, jnp.nan)
+
+    def climb(k, rising):
+        part = end.rate * k / (WAYPOINTS + 1)
+        return rising & (output_and_slope(model, {**signals, "rate": part})[1] / gain > 0)
+
+    return jnp.where(jax.lax.fori_loop(1, WAYPOINTS + 1, climb, end.found), end.rate, jnp.nan)

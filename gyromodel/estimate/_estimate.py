@@ -75,7 +75,7 @@ class Estimate:
                 effect = replace(effect, unit=unit)  # pyright: ignore[reportCallIssue]
             effects.append(effect)
         for name in ("rate", "temperature"):
-            values = np.asarray(record.signals.get(name, np.nan))[..., : record.rows]
+            values = np.ravel(record.signals.get(name, np.nan))[: record.rows]
             if np.isfinite(values).any():
                 validity[name] = (float(np.nanmin(values)), float(np.nanmax(values)))
         model = GyroModel(tuple(effects), self.model.noise, self.model.fixed, self.model.gyro)

@@ -22,6 +22,20 @@ $statements
     return $output;
 }
 
+/* The rate itself where the output rises all the way from rest; else NaN: it lies on another branch. */
+static inline double gyromodel_on_branch(const gyromodel_sample *x, double gain, double rate)
+{
+    int k;
+
+    for (k = 1; k <= $waypoints; k++) {
+        double slope;
+        (void)gyromodel_output(x, rate * k / ($waypoints + 1), &slope);
+        if (!(slope / gain > 0.0))
+            return NAN;
+    }
+    return rate;
+}
+
 /* The rate (rad/s) that gives the sample's output, on the branch through rest; NaN where there is none.
    Newton's method from output/gain, kept between the rates that are known to lie below and above the answer. */
 static inline double gyromodel_rate(const gyromodel_sample *x)
@@ -53,13 +67,13 @@ static inline double gyromodel_rate(const gyromodel_sample *x)
             below = 0;
         }
         if (rising && fabs(newton - rate) <= size)
-            return newton;
+            return gyromodel_on_branch(x, gain, newton);
         if (rising && newton > low && newton < high)
             rate = newton;
         else
             rate = isinf(low) || isinf(high) ? rate / 2.0 : (low + high) / 2.0;
         if (high - low <= size) /* the output jumps over the measured value, or never reaches it */
-            return below && above ? rate : NAN;
+            return below && above ? gyromodel_on_branch(x, gain, rate) : NAN;
     }
     return NAN;
 }

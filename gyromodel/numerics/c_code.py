@@ -130,11 +130,12 @@ class Statements:
         if name == "integer_pow":
             return [self._power(operands[0], parameters["y"])]
         if name in _REDUCTIONS:
-            rows = np.moveaxis(operands[0], parameters["axes"], range(len(parameters["axes"])))
-            rows = rows.reshape(-1, *rows.shape[len(parameters["axes"]) :])
-            return [reduce(lambda a, b: self._each(_ELEMENTWISE[_REDUCTIONS[name]], kind, a, b), rows)]
+            axes = parameters["axes"]
+            rows = np.moveaxis(operands[0], axes, range(len(axes)))
+            return [self._folded(_REDUCTIONS[name], kind, rows.reshape(-1, *rows.shape[len(axes) :]))]
         if name == "dot_general" and parameters["dimension_numbers"][1] == ((), ()):
-            return [self._dot(*operands, *parameters["dimension_numbers"][0])]
+            (left, right), _ = parameters["dimension_numbers"]
+            return [self._dot(operands[0], operands[1], left, right)]
         raise NoCForm(name)
 
     def _each(self, template: str, kind: str, *operands: np.ndarray) -> np.ndarray:
@@ -171,9 +172,13 @@ class Statements:
         shape = (*a.shape[len(left) :], *b.shape[len(right) :])
         terms = math.prod(a.shape[: len(left)])
         a, b = a.reshape(terms, -1), b.reshape(terms, -1)
-        products = [self._each(_ELEMENTWISE["mul"], _REAL, a[i][:, None], b[i][None, :]) for i in range(terms)]
-        total = reduce(lambda x, y: self._each(_ELEMENTWISE["add"], _REAL, x, y), products)
-        return total.reshape(shape)
+        products = self._each(_ELEMENTWISE["mul"], _REAL, a[:, :, None], b[:, None, :])
+        return self._folded("add", _REAL, products).reshape(shape)
+
+    def _folded(self, name: str, kind: str, rows: np.ndarray) -> np.ndarray:
+        """One array from several, two at a time."""
+        each = (rows[i, ...] for i in range(len(rows)))
+        return reduce(lambda x, y: self._each(_ELEMENTWISE[name], kind, x, y), each)
 
 
 def _bound(equation: JaxprEqn, operands: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -192,7 +197,7 @@ def _moved(equation: JaxprEqn, operands: Sequence[np.ndarray]) -> list[np.ndarra
             continue
         numbered.append(np.arange(len(atoms), len(atoms) + operand.size).reshape(operand.shape))
         atoms += np.ravel(operand if operand.dtype == object else _literals(operand)).tolist()
-    return [np.array(atoms, object)[numbers] for numbers in _bound(equation, numbered)]
+    return [np.asarray(np.array(atoms, object)[numbers], object) for numbers in _bound(equation, numbered)]
 
 
 def _literals(values: np.ndarray) -> np.ndarray:
