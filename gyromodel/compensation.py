@@ -29,7 +29,7 @@ MOST_STEPS = 64
 WAYPOINTS = 8
 # Samples solved together: what a million of them need stays in cache, and only their own slowest holds them up.
 BLOCK = 1 << 15
-# A rate lies outside the calibration beyond this many of its standard uncertainties: of a million noisy ones, none by chance.
+# A rate lies outside the calibration beyond this many of its standard uncertainties: of a million, none by chance.
 SURELY = 6.0
 # Ranges in files are rounded to ten digits.
 ROUNDING = 1e-9
