@@ -27,8 +27,6 @@ TOLERANCE = 1e-9
 MOST_STEPS = 64
 # Rates between rest and the answer at which the output must rise, or the answer lies on another branch.
 WAYPOINTS = 8
-# Samples solved together: what a million of them need stays in cache, and only their own slowest holds them up.
-BLOCK = 1 << 15
 # A rate lies outside the calibration beyond this many of its standard uncertainties: of a million, none by chance.
 SURELY = 6.0
 # Ranges in files are rounded to ten digits.
@@ -82,11 +80,9 @@ def _estimate(calibration: Calibration, record: Record) -> tuple[np.ndarray, np.
     output = jnp.where(record.sampling.present, record.signals["output"], jnp.nan)
     white = jnp.asarray(model.noise.get("noise_white", 0.0)) ** 2 / record.interval
     spread = np.zeros((len(model.slots()),) * 2) if covariance is None else covariance
-    parts = []
-    for start in range(0, len(output), BLOCK):
-        part = {name: _block(values, start) for name, values in signals.items()}
-        parts.append(_solve(model, jnp.asarray(spread), white, part, _block(output, start)))
-    rate, variance = (np.concatenate(found)[: record.rows] for found in zip(*parts, strict=True))
+    # The whole record at once: effects may look at what came before.
+    found = _solve(model, jnp.asarray(spread), white, signals, output)
+    rate, variance = (np.asarray(values)[: record.rows] for values in found)
     return rate, variance if _held(calibration) else np.full_like(variance, np.nan)
 
 
@@ -117,12 +113,6 @@ def _notes(
     if not model.noise:
         notes.append("The model states no noise: rate_estimated_std leaves it out.")
     return notes
-
-
-def _block(values: Float[Array, " sample"], start: int) -> Float[Array, " block"]:
-    """A block of a long record, the last one filled up; a short record whole."""
-    block = values[start : start + BLOCK]
-    return block if len(values) <= BLOCK else jnp.pad(block, (0, BLOCK - len(block)), mode="edge")
 
 
 @eqx.filter_jit
@@ -169,7 +159,7 @@ def invert(model: GyroModel, signals: Signals, output: Float[Array, " sample"]) 
     answer is the rate of the jump.
 
     Args:
-        model: acts on each sample by itself.
+        model: its output depends on the rate of the same sample only.
         signals: covariates in internal units; a `rate` is not used.
         output: internal unit; NaN where missing.
 

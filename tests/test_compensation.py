@@ -13,7 +13,6 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 from scipy.stats import binom, t
 
-from gyromodel import compensation
 from gyromodel._checks import CampaignError
 from gyromodel.campaign import Campaign
 from gyromodel.compensation import compensate
@@ -127,18 +126,6 @@ def test_a_spline_is_inverted(rng: np.random.Generator):
     assert np.diff(knots + at_knots).min() > 0
     result = compensate(bench(output), Calibration(GyroModel((effect,))))
     assert rates(result) == pytest.approx(inside, rel=1e-10, abs=1e-12)
-
-
-def test_a_long_record_is_solved_in_blocks(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch):
-    temperature, truth = rng.uniform(10, 50, ROWS), rng.uniform(-1.5, 1.5, ROWS)
-    campaign = bench(polynomial(truth, temperature), temperature=temperature)
-    calibration = Calibration(GyroModel(MODELS[polynomial], {"noise_white": value(1e-3)}))
-    whole = compensate(campaign, calibration)
-    monkeypatch.setattr(compensation, "BLOCK", 64)
-    parts = compensate(campaign, calibration)
-    assert rates(parts) == pytest.approx(truth, rel=1e-10, abs=1e-12)
-    assert rates(parts) == pytest.approx(rates(whole), rel=1e-13)
-    assert stds(parts) == pytest.approx(stds(whole), rel=1e-13)
 
 
 FOLDS = {
