@@ -14,19 +14,23 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from gyromodel._checks import CampaignError as CampaignError
     from gyromodel.campaign import Campaign as Campaign
+    from gyromodel.compensation import compensate as compensate
     from gyromodel.diagnosis import Diagnosis as Diagnosis
     from gyromodel.diagnosis import diagnose as diagnose
     from gyromodel.effects import CATALOGUE as CATALOGUE
     from gyromodel.effects import Effect as Effect
+    from gyromodel.estimate import Calibration as Calibration
     from gyromodel.estimate import Estimate as Estimate
     from gyromodel.estimate import fit as fit
     from gyromodel.estimate import fit_function as fit_function
     from gyromodel.estimate import two_stage as two_stage
+    from gyromodel.export import export_calibration as export_calibration
     from gyromodel.files import read_campaign as read_campaign
     from gyromodel.files import write_campaign as write_campaign
     from gyromodel.model import GyroModel as GyroModel
     from gyromodel.model import model_from_effects as model_from_effects
     from gyromodel.model import simulate as simulate
+    from gyromodel.model_files import read_calibration as read_calibration
     from gyromodel.model_files import read_model as read_model
     from gyromodel.model_files import write_model as write_model
     from gyromodel.numerics.uncertain import Uncertain as Uncertain
@@ -38,6 +42,7 @@ __version__ = "0.1.0"
 
 _MODULE_OF = {
     "CATALOGUE": "effects",
+    "Calibration": "estimate",
     "Campaign": "campaign",
     "CampaignError": "_checks",
     "Diagnosis": "diagnosis",
@@ -46,10 +51,13 @@ _MODULE_OF = {
     "GyroModel": "model",
     "Uncertain": "numerics.uncertain",
     "UnitError": "units",
+    "compensate": "compensation",
     "diagnose": "diagnosis",
+    "export_calibration": "export",
     "fit": "estimate",
     "fit_function": "estimate",
     "model_from_effects": "model",
+    "read_calibration": "model_files",
     "read_campaign": "files",
     "read_model": "model_files",
     "simulate": "model",

@@ -60,7 +60,7 @@ def check_unit(name: str, unit: str | None) -> str:
         raise CampaignError(f"{shown(name)} cannot name a column: {rule}")
     if name in DERIVED:
         raise CampaignError(f"column '{name}' has the name of a signal that is derived from others: rename it")
-    known = next(((meaning, examples) for pattern, meaning, examples in _EXPECTED if pattern.fullmatch(name)), None)
+    known = _known(name)
     if unit is None:
         accepted = f"{known[0]}: {listed(known[1])}" if known else unit_system.ACCEPTED
         example = known[1][0] if known else "unit"
@@ -72,6 +72,17 @@ def check_unit(name: str, unit: str | None) -> str:
     if known and not any(unit_system.convertible(unit, example) for example in known[1]):
         raise CampaignError(f"column '{name}' has unit [{unit}], expected {known[0]}, such as {listed(known[1])}")
     return unit
+
+
+def _known(name: str) -> tuple[str, list[str]] | None:
+    """What a known column measures, and examples of its unit."""
+    return next(((meaning, examples) for pattern, meaning, examples in _EXPECTED if pattern.fullmatch(name)), None)
+
+
+def usual_unit(name: str) -> str:
+    """Internal unit of a known column; dimensionless for any other."""
+    known = _known(name)
+    return unit_system.internal_unit(known[1][0]) if known else ""
 
 
 def check_time(time: np.ndarray, first_row: int = 1, previous: float | None = None) -> None:

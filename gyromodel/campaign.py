@@ -96,6 +96,11 @@ class Campaign:
         """A copy with one column added or replaced; `values` is array-like, in `unit`."""
         return self._derived({**self.columns, name: values}, {**self.units, name: unit})
 
+    def with_metadata(self, entries: Mapping[str, str | int | float | None]) -> Campaign:
+        """A copy with metadata added or replaced; None removes."""
+        metadata = {key: value for key, value in {**self.metadata, **entries}.items() if value is not None}
+        return _restore(self.columns, self.units, metadata, self.name)
+
     def without(self, name: str) -> Campaign:
         """A copy without one column."""
         self._column(name)

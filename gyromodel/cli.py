@@ -205,6 +205,52 @@ def simulate(
 
 
 @app.command()
+def compensate(
+    model: Annotated[Path, typer.Argument(metavar="M.yaml", help="A fitted model.")],
+    campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Its output and what the model needs besides.")],
+    output: CampaignFile,
+    axis: Axis = None,
+    as_json: AsJson = False,
+) -> None:
+    """Apply a calibration: add the estimated rate and its standard uncertainty to a campaign."""
+    _refuse_overwriting(output, [model, campaign])
+    from gyromodel.compensation import compensate as compensate_campaign
+    from gyromodel.files import write_campaign
+    from gyromodel.model_files import read_calibration
+
+    calibration = read_calibration(model)
+    compensated = compensate_campaign(_read([campaign], axis)[0], calibration)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    write_campaign(compensated, output)
+    note = str(compensated.metadata.get("rate_estimated_note", ""))
+    if note:
+        print(f"gyromodel: {note}", file=sys.stderr)
+    result = {"campaign": str(output), "rows": len(compensated), "note": note, "data_hash": compensated.digest()}
+    print(_json(result) if as_json else f"{len(compensated)} samples in {output}\n", end="")
+
+
+@app.command()
+def export(
+    model: Annotated[Path, typer.Argument(metavar="M.yaml", help="A model with values.")],
+    to: Annotated[Literal["c", "json", "csv"], typer.Option("--to", help="C99 source, JSON, or CSV.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE", help="File to write; printed without.")
+    ] = None,
+) -> None:
+    """Write a calibration for firmware and spreadsheets."""
+    if output:
+        _refuse_overwriting(output, [model])
+    from gyromodel.export import export_calibration
+    from gyromodel.model_files import read_calibration
+
+    text = export_calibration(read_calibration(model), to)
+    if output:
+        write_text(output, text)
+    else:
+        print(text, end="")
+
+
+@app.command()
 def effects(
     effect: Annotated[str | None, typer.Argument(metavar="ID", help="One effect, in full.", show_default=False)] = None,
     as_json: AsJson = False,

@@ -16,16 +16,18 @@ from gyromodel import __version__
 from gyromodel._atomic import write_text
 from gyromodel.effects import Effect
 from gyromodel.effects.drivers import BiasColumn
-from gyromodel.estimate import Estimate
+from gyromodel.estimate import Calibration, Estimate
 from gyromodel.model import GyroModel, ModelError, make_effect, parameter_unit
 from gyromodel.noise import NOISE_UNITS
 from gyromodel.signals import Record
 from gyromodel.units import UnitError, convertible, factor, from_internal, internal_unit, quantity, to_internal
 
-# Written into fitted models for the reader; not needed to use them again.
+# Written into fitted models; `read_calibration` reads them, and no other use of the model needs them.
 RECORD_KEYS = ("fit", "software")
 # What a scale factor can be: output per rate; a plain number where the output is itself a rate.
 GAIN_UNITS = ("count/deg", "count/(deg/s)", "bit/deg", "bit/(deg/s)", "V/(deg/s)", "V/deg", "A/(deg/s)", "1/deg", "")
+FIT_KEYS = ("degrees_of_freedom", "validity", "data_hash", "covariance")
+VALIDITY_UNITS = {"rate": "deg/s", "temperature": "degC"}
 SETTING_UNITS = {"reference": "degC", "full_rate": "deg/s", "lowest": "deg/s"}
 
 _NUMBER = re.compile(r"\s*[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?")
@@ -40,7 +42,7 @@ class _Place:
     def error(self, message: str) -> ModelError:
         return _complaint(self.path, self.node.start_mark.line, message)
 
-    def mapping(self, allowed: tuple[str, ...], what: str) -> dict[str, _Place]:
+    def mapping(self, allowed: tuple[str, ...], what: str, *, complete: bool = False) -> dict[str, _Place]:
         if not isinstance(self.node, yaml.MappingNode):
             raise self.error(f"expected {what} as key: value pairs")
         found: dict[str, _Place] = {}
@@ -52,6 +54,8 @@ class _Place:
             if name in found:
                 raise place.error(f"{name!r} appears twice")
             found[name] = _Place(self.path, value)
+        if complete and (missing := [name for name in allowed if name not in found]):
+            raise self.error(f"{what} lacks {missing[0]}; fit the model again")
         return found
 
     def items(self, what: str) -> list[_Place]:
@@ -107,7 +111,44 @@ def read_model(path: str | Path) -> GyroModel:
     Raises:
         ModelError: the file is not a model; the message names the line.
     """
-    path = Path(path)
+    return _read(Path(path))[0]
+
+
+def read_calibration(path: str | Path) -> Calibration:
+    """Read a model with what its fit left in the file; one that was not fitted has neither covariance nor validity.
+
+    Raises:
+        ModelError: the file is not a model, misses a value, or its covariance is not that of its free parameters.
+    """
+    model, top = _read(Path(path))
+    if "fit" not in top:
+        return Calibration(model)
+    fit = top["fit"].mapping(FIT_KEYS, "fit", complete=True)
+    validity = {}
+    for name, place in fit["validity"].mapping(tuple(VALIDITY_UNITS), "validity").items():
+        ends = [end.number_in(VALIDITY_UNITS[name]) for end in place.items("a range")]
+        if len(ends) != 2 or ends[0] > ends[1]:
+            raise place.error("a range is its lowest and its highest value")
+        validity[name] = (ends[0], ends[1])
+    covariance = _read_covariance(fit["covariance"], parameter_names(model))
+    degrees = fit["degrees_of_freedom"].number_in("")
+    return Calibration(model, covariance, validity, int(degrees), fit["data_hash"].text())
+
+
+def _read_covariance(place: _Place, names: list[str]) -> np.ndarray:
+    found = place.mapping(("parameters", "unit", "matrix"), "a covariance", complete=True)
+    if [item.text() for item in found["parameters"].items("parameters")] != names:
+        raise found["parameters"].error(
+            "the covariance is not that of the model's free parameters; fit the model again"
+        )
+    rows = [row.items("a row of the matrix") for row in found["matrix"].items("the matrix")]
+    if any(len(row) != len(names) for row in [rows, *rows]):
+        raise found["matrix"].error(f"the matrix needs {len(names)} rows of as many numbers")
+    return np.array([[entry.number_in("") for entry in row] for row in rows]).reshape(len(names), len(names))
+
+
+def _read(path: Path) -> tuple[GyroModel, dict[str, _Place]]:
+    """The model of a file, and the file's entries."""
     node = _compose(path)
     if node is None:
         raise _complaint(path, 0, "the file is empty; it needs a list of effects")
@@ -125,7 +166,7 @@ def read_model(path: str | Path) -> GyroModel:
     noise = _read_noise(top["noise"]) if "noise" in top else {}
     gyro = top["gyro"].text() if "gyro" in top else ""
     try:
-        return GyroModel(tuple(effects), noise, frozenset().union(*fixed.values()), gyro)
+        return GyroModel(tuple(effects), noise, frozenset().union(*fixed.values()), gyro), top
     except ModelError as problem:
         raise top["effects"].error(str(problem)) from None
 
@@ -304,23 +345,25 @@ def _document(model: GyroModel, estimate: Estimate | None) -> dict[str, Any]:
 
 
 def _fit_record(estimate: Estimate) -> dict[str, Any]:
-    record, model = estimate.record, estimate.model
-    validity = {}
-    for name, unit in (("rate", "deg/s"), ("temperature", "degC")):
-        if np.isfinite(record.signals.get(name, np.nan)).any():
-            values = from_internal(np.asarray(record.signals[name])[: record.rows], unit)
-            validity[name] = [f"{np.nanmin(values):.10g} {unit}", f"{np.nanmax(values):.10g} {unit}"]
-    names = [f"{model.labels[s.effect]}.{s.field}[{s.index}]" for s in model.slots()]
+    record, validity = estimate.record, {}
+    for name, ends in estimate.calibration().validity.items():
+        unit = VALIDITY_UNITS[name]
+        validity[name] = [f"{from_internal(end, unit):.10g} {unit}" for end in ends]
     return {
         "degrees_of_freedom": estimate.degrees_of_freedom,
         "validity": validity,
         "data_hash": record.data_hash,
         "covariance": {
-            "parameters": names,
+            "parameters": parameter_names(estimate.model),
             "unit": "internal units of each parameter (rad, s, °C, count)",
             "matrix": [[float(v) for v in row] for row in estimate.covariance],
         },
     }
+
+
+def parameter_names(model: GyroModel) -> list[str]:
+    """The free parameters as the covariance in a file names them."""
+    return [f"{model.labels[s.effect]}.{s.field}[{s.index}]" for s in model.slots()]
 
 
 def _unit_of(effect: Effect, name: str, record: Record | None) -> str:

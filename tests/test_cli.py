@@ -7,6 +7,7 @@ line and the points at 30, 50, 70 and 110 deg/s do not (the line and the misses 
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 from collections.abc import Callable
@@ -17,8 +18,9 @@ from typing import Any
 import pytest
 
 from gyromodel import cli
+from gyromodel.files import read_campaign
 
-COMMANDS = ("demo", "fit", "diagnose", "simulate", "effects")
+COMMANDS = ("demo", "fit", "diagnose", "simulate", "compensate", "export", "effects")
 HEAVY = {"jax", "equinox", "numpy", "pandas", "pint", "matplotlib", "xarray", "scipy", "rich"}
 
 PLAN = """\
@@ -143,6 +145,10 @@ def test_the_module_runs_as_a_program():
         ["diagnose", "campaign.csv", "--model", "m.yaml", "-o", "out", "--seed", "one"],
         ["simulate", "m.yaml", "-o", "out.csv"],
         ["simulate", "m.yaml", "-o", "out.csv", "--like", "a.csv", "--plan", "b.yaml"],
+        ["compensate", "m.yaml", "campaign.csv"],
+        ["compensate", "m.yaml", "-o", "out.csv"],
+        ["export", "m.yaml"],
+        ["export", "m.yaml", "--to", "fortran"],
         ["effects", "bias_temprature"],
         ["effects", "--unknown"],
     ],
@@ -225,6 +231,97 @@ def test_a_fitted_model_is_an_input_of_every_command(bench: Path, run: Run):
     assert run("simulate", fitted, "--like", campaign, "-o", bench / "again.csv").status == 0
     refit = run("fit", bench / "again.csv", "--model", fitted, "-o", bench / "refit")
     assert refit.status == 0, refit.err
+
+
+@pytest.fixture
+def fitted(bench: Path, run: Run) -> Path:
+    """The bench with a fitted model beside its campaign."""
+    done = run("fit", bench / "campaign.csv", "--model", bench / "simulation.yaml", "-o", bench / "fit")
+    assert done.status == 0, done.err
+    return bench
+
+
+@pytest.mark.parametrize("name", ["rate.csv", "rate.csv.gz", "rate.parquet", "rate.nc", "new/rate.zarr"])
+def test_compensate_recovers_the_rate(fitted: Path, run: Run, name: str):
+    done = run("compensate", fitted / "fit" / "model.yaml", fitted / "campaign.csv", "-o", fitted / name, "--json")
+    assert done.status == 0, done.err
+    assert done.err == ""
+    campaign, result = read_campaign(fitted / "campaign.csv"), read_campaign(fitted / name)
+    said = json.loads(done.out)
+    assert (said["rows"], said["note"], said["data_hash"]) == (360, "", result.digest())
+    added = ["rate_estimated", "rate_estimated_std"]
+    assert list(result.columns) == [*campaign.columns, *added]
+    error = result.columns["rate_estimated"] - campaign.columns["rate"]
+    std = result.columns["rate_estimated_std"]
+    # 0.02 deg/√h at 20 s, and six standard deviations.
+    assert std == pytest.approx(0.02 / 60 / 20**0.5, rel=0.3)
+    assert abs(error / std).max() < 6
+    assert 0.8 < (error / std).std() < 1.2
+
+
+def test_compensate_says_what_its_user_must_know(fitted: Path, run: Run):
+    model = fitted / "fit" / "model.yaml"
+    lines = (fitted / "campaign.csv").read_text(encoding="utf-8").splitlines()
+    head = next(i for i, line in enumerate(lines) if line.startswith("time"))
+    names = lines[head].split(",")
+    rows = [dict(zip(names, line.split(","), strict=True)) for line in lines[head + 1 :]]
+    kept = ["time [s]", "temperature [degC]", "output [count/s]"]
+    rows[0]["temperature [degC]"] = "90"
+    rows[1]["output [count/s]"] = ""
+    text = [*lines[:head], ",".join(kept), *(",".join(row[name] for name in kept) for row in rows)]
+    (fitted / "hot.csv").write_text("\n".join(text), encoding="utf-8")
+    done = run("compensate", model, fitted / "hot.csv", "-o", fitted / "out.csv")
+    assert done.status == 0
+    assert done.err == ("gyromodel: 1 of 359 samples lie outside the calibrated range of temperature, 20 to 50 degC.\n")
+    assert "360 samples in" in done.out
+    result = read_campaign(fitted / "out.csv")
+    assert result.metadata["rate_estimated_note"] in done.err
+    assert math.isnan(result.columns["rate_estimated"][1])
+    assert math.isfinite(result.columns["rate_estimated"][0])
+
+
+@pytest.mark.parametrize(
+    ("model", "expected"),
+    [
+        (SIMULATION, "no value"),
+        (TRUTH.replace("scale_factor", "bias_drift").replace("1000 count/deg", "1 deg/h/h"), "needs a scale_factor"),
+        (TRUTH.replace("1000 count/deg", "1000 V/(deg/s)"), "scale_factor is in V/(deg/s)"),
+        (TRUTH.replace("effect: bias\n", "effect: bias_pressure\n").replace("5 deg/h", "5 deg/h/mbar"), "no value"),
+        (
+            TRUTH.replace("effect: bias\n", "effect: bias_pressure\n    reference: 1 bar\n").replace(
+                "5 deg/h", "5 deg/h/mbar"
+            ),
+            "needs a column pressure",
+        ),
+        (TRUTH + "fit: {}\n", "fit lacks degrees_of_freedom"),
+        (TRUTH.replace("effects", "efects"), "efects"),
+    ],
+)
+def test_compensate_refuses_what_it_cannot_apply(tmp_path: Path, run: Run, model: str, expected: str):
+    (tmp_path / "campaign.csv").write_text(CAMPAIGN, encoding="utf-8")
+    (tmp_path / "model.yaml").write_text(model, encoding="utf-8")
+    outcome = run("compensate", tmp_path / "model.yaml", tmp_path / "campaign.csv", "-o", tmp_path / "out.csv")
+    assert expected in refusal(outcome)
+    assert not (tmp_path / "out.csv").exists()
+
+
+@pytest.mark.parametrize(("to", "part"), [("c", "gyromodel_rate"), ("json", '"covariance"'), ("csv", "scale_factor,")])
+def test_export_prints_or_writes(fitted: Path, run: Run, to: str, part: str):
+    model = fitted / "fit" / "model.yaml"
+    printed = run("export", model, "--to", to)
+    assert printed.status == 0, printed.err
+    assert part in printed.out
+    assert run("export", model, "--to", to, "-o", fitted / "new" / "file").out == ""
+    assert (fitted / "new" / "file").read_text(encoding="utf-8") == printed.out
+    assert run("export", model, "--to", to, "-o", model).status == 2
+
+
+def test_export_lists_its_forms(run: Run):
+    assert "'c', 'json', 'csv'" in run("export", "m.yaml", "--to", "px4").err
+
+
+def test_export_refuses_a_model_without_values(bench: Path, run: Run):
+    assert "no value" in refusal(run("export", bench / "simulation.yaml", "--to", "c"))
 
 
 def test_diagnose_writes_its_results(bench: Path, run: Run):
@@ -346,6 +443,7 @@ def test_inputs_are_never_overwritten(bench: Path, run: Run):
     assert run("fit", campaign, "--model", bench / "model.yaml", "-o", bench).status == 2
     assert run("diagnose", campaign, "--model", bench / "model.yaml", "-o", bench).status == 2
     assert run("simulate", truth, "--like", campaign, "-o", campaign).status == 2
+    assert run("compensate", truth, campaign, "-o", campaign).status == 2
     assert (bench / "model.yaml").read_text(encoding="utf-8") == SIMULATION
     assert campaign.read_bytes() == before
 

@@ -23,7 +23,7 @@ from gyromodel.effects.scale import ScaleFactor, ScaleSpline
 from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureCurve
 from gyromodel.estimate import Estimate, fit
 from gyromodel.model import GyroModel, ModelError, make_effect, model_from_effects
-from gyromodel.model_files import read_model, write_model
+from gyromodel.model_files import read_calibration, read_model, write_model
 from gyromodel.signals import read_signals
 from tests.helpers import MUTANTS, SHARED_FOLDER, mutated
 
@@ -389,6 +389,88 @@ def test_a_damaged_file_is_read_or_refused(tmp_path: Path, text: str, changes: l
     except ModelError as problem:
         complaint = str(problem)
     assert not complaint or re.fullmatch(r"model\.yaml, line \d+: .+", complaint)
+
+
+FIT = """\
+effects:
+  - effect: bias
+    value: 3 deg/h
+fit:
+  degrees_of_freedom: 7
+  validity: {temperature: [10 degC, 50 degC], rate: [-20 deg/s, 20 deg/s]}
+  data_hash: abc
+  covariance:
+    parameters: ["bias.value[0]"]
+    unit: internal
+    matrix: [[4.0e-12]]
+"""
+
+
+def test_a_calibration_is_a_model_with_what_its_fit_left(tmp_path: Path):
+    (tmp_path / "model.yaml").write_text(FIT, encoding="utf-8")
+    calibration = read_calibration(tmp_path / "model.yaml")
+    assert calibration.std == pytest.approx([2e-6])
+    assert (calibration.degrees_of_freedom, calibration.data_hash) == (7, "abc")
+    assert calibration.validity["temperature"] == (10.0, 50.0)
+    assert calibration.validity["rate"] == pytest.approx((-np.deg2rad(20), np.deg2rad(20)))
+    assert contents(calibration.model) == contents(read_model(tmp_path / "model.yaml"))
+
+
+def test_a_calibration_outlives_its_file(tmp_path: Path, rng: np.random.Generator):
+    rate, pressure = rng.uniform(-10, 10, 60), rng.uniform(900, 1100, 60)
+    columns = {"time": np.arange(60.0), "rate": rate, "pressure": pressure, "temperature": 20 + rng.random(60)}
+    columns["output"] = 1000 * (rate + 1e-4 * pressure) + rng.standard_normal(60)
+    units = {"time": "s", "rate": "deg/s", "pressure": "mbar", "temperature": "degC", "output": "count/s"}
+    model = GyroModel((ScaleFactor(), Bias(), BiasColumn(column="pressure")), {"noise_white": jnp.asarray(1e-3)})
+    estimate = fit(Campaign(columns, units, {"kind": "rate"}), model)
+    write_model(estimate, tmp_path / "fitted.yaml")
+    direct, again = estimate.calibration(), read_calibration(tmp_path / "fitted.yaml")
+    assert contents(again.model)[:3] == contents(direct.model)[:3]
+    assert np.array_equal(again.covariance, estimate.covariance)
+    assert again.table() == direct.table() == estimate.table()
+    assert (again.degrees_of_freedom, again.data_hash) == (direct.degrees_of_freedom, direct.data_hash)
+    assert set(again.validity) == {"rate", "temperature"}
+    for name, ends in direct.validity.items():
+        assert again.validity[name] == pytest.approx(ends, rel=1e-9)
+
+
+def test_a_calibration_without_a_fit_has_no_covariance(tmp_path: Path):
+    (tmp_path / "model.yaml").write_text(FIT.partition("fit:")[0], encoding="utf-8")
+    calibration = read_calibration(tmp_path / "model.yaml")
+    assert calibration.covariance is None
+    assert np.isnan(calibration.std).all()
+    assert not calibration.validity
+
+
+@pytest.mark.parametrize(
+    ("found", "put", "line", "message"),
+    [
+        ("  data_hash: abc\n", "", 5, "fit lacks data_hash"),
+        ("    unit: internal\n", "", 9, "a covariance lacks unit"),
+        ("[[4.0e-12]]", "[[4.0e-12, 0]]", 11, "1 rows of as many numbers"),
+        ("[[4.0e-12]]", "[4.0e-12]", 11, "a row of the matrix as a list"),
+        ("[[4.0e-12]]", "[[much]]", 11, "is no quantity"),
+        ("[[4.0e-12]]", "[[4 deg]]", 11, "not in a plain number"),
+        ("bias.value[0]", "bias.size[0]", 9, "not that of the model's free parameters"),
+        (
+            "    value: 3 deg/h\n",
+            "    value: 3 deg/h\n    fixed: true\n",
+            10,
+            "not that of the model's free parameters",
+        ),
+        ("[10 degC, 50 degC]", "[50 degC, 10 degC]", 6, "its lowest and its highest"),
+        ("[10 degC, 50 degC]", "[10 degC]", 6, "its lowest and its highest"),
+        ("temperature:", "pressure:", 6, "unknown key 'pressure' in validity"),
+        ("7", "seven", 5, "is no quantity"),
+    ],
+)
+def test_mistakes_in_a_fit_are_named_with_their_line(found: str, put: str, line: int, message: str, tmp_path: Path):
+    assert found in FIT
+    (tmp_path / "model.yaml").write_text(FIT.replace(found, put), encoding="utf-8")
+    with pytest.raises(ModelError) as caught:
+        read_calibration(tmp_path / "model.yaml")
+    assert str(caught.value).startswith(f"model.yaml, line {line}: ")
+    assert message in str(caught.value)
 
 
 def test_one_value_stands_for_a_list_of_one(tmp_path: Path):

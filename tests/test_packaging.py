@@ -74,7 +74,7 @@ def test_diagnose_stays_a_function_after_its_room_was_imported():
     assert python(code) == "True True"
 
 
-@pytest.mark.parametrize("name", ["report/template.html", "data/ring_laser_table.csv", "py.typed"])
+@pytest.mark.parametrize("name", ["report/template.html", "export/template.h", "data/ring_laser_table.csv", "py.typed"])
 def test_data_files_are_shipped(name: str):
     assert (Path(gyromodel.__file__).parent / name).is_file()
 

@@ -1,5 +1,6 @@
 """Joint generalised least squares with the noise estimated alongside; estimates carry their covariance."""
 
+from gyromodel.estimate._calibration import Calibration
 from gyromodel.estimate._estimate import Estimate, EstimateError
 from gyromodel.estimate._fit import (
     check_covariates,
@@ -14,6 +15,7 @@ from gyromodel.estimate._function import FunctionFit, fit_function
 from gyromodel.estimate._two_stage import two_stage
 
 __all__ = [
+    "Calibration",
     "Estimate",
     "EstimateError",
     "FunctionFit",

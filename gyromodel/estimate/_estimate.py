@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
+from gyromodel.estimate._calibration import Calibration, ParameterRow
 from gyromodel.model import GyroModel, parameter_unit
 from gyromodel.noise import NOISE_UNITS, NoiseRatios, coefficients
 from gyromodel.numerics.uncertain import Source, Uncertain, factor_of
@@ -17,16 +18,6 @@ from gyromodel.units import factor, internal_unit
 
 class EstimateError(ValueError):
     """The data cannot determine what was asked; the message names the effects and what to do."""
-
-
-class ParameterRow(NamedTuple):
-    """One fitted parameter in its reporting unit."""
-
-    effect: str
-    name: str
-    value: float
-    std: float
-    unit: str
 
 
 @dataclass(frozen=True)
@@ -85,21 +76,27 @@ class Estimate:
         """The fitted model with its noise to be estimated again, unless it was stated."""
         return self.model if self.noise_given else GyroModel(self.model.effects, {}, self.model.fixed, self.model.gyro)
 
+    def calibration(self) -> Calibration:
+        """What it takes to use the fit elsewhere: the model with its units, the covariance, and the ranges it has seen.
+
+        `write_model` keeps it in the model file, and `read_calibration` reads it.
+        """
+        record, effects, validity = self.record, [], {}
+        for effect in self.model.effects:
+            if hasattr(effect, "unit"):
+                unit = parameter_unit(effect, next(iter(effect.declared())), record.output_unit, record.units)
+                effect = replace(effect, unit=unit)  # pyright: ignore[reportCallIssue]
+            effects.append(effect)
+        for name in ("rate", "temperature"):
+            values = np.ravel(record.signals.get(name, np.nan))[: record.rows]
+            if np.isfinite(values).any():
+                validity[name] = (float(np.nanmin(values)), float(np.nanmax(values)))
+        model = GyroModel(tuple(effects), self.model.noise, self.model.fixed, self.model.gyro)
+        return Calibration(model, self.covariance, validity, self.degrees_of_freedom, record.data_hash)
+
     def table(self) -> tuple[ParameterRow, ...]:
         """Every parameter in its reporting unit; those held fixed have standard uncertainty zero."""
-        spread = {(s.effect, s.field, s.index): sd for s, sd in zip(self.model.slots(), self.std, strict=True)}
-        rows = []
-        for i, effect in enumerate(self.model.effects):
-            for name in effect.declared():
-                unit = parameter_unit(effect, name, self.record.output_unit, self.record.units)
-                scale = factor(internal_unit(unit), unit)
-                values = np.ravel(getattr(effect, name))
-                for j, value in enumerate(values):
-                    shown = name if len(values) == 1 else f"{name}[{j}]"
-                    rows.append(
-                        ParameterRow(effect.label, shown, value * scale, spread.get((i, name, j), 0.0) * scale, unit)
-                    )
-        return tuple(rows)
+        return self.calibration().table()
 
     def noise_table(self) -> dict[str, dict[str, float | str]]:
         """Noise coefficients with their 95 % intervals, in reporting units."""

@@ -1,0 +1,207 @@
+"""A calibration applied: the input rate of each sample from the output, with its standard uncertainty.
+
+The model predicts the output from the rate; here the equation is solved for the rate, sample by sample.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from gyromodel.campaign import Campaign
+from gyromodel.effects import Signals
+from gyromodel.estimate import Calibration, check_covariates
+from gyromodel.model import GyroModel, check_units
+from gyromodel.model_files import VALIDITY_UNITS
+from gyromodel.signals import Record, read_signals
+from gyromodel.units import from_internal
+
+# Newton's steps shrink quadratically: after one of this relative size the next would be lost in rounding.
+TOLERANCE = 1e-9
+# Newton needs 3 to 6 steps; next to a fold or a jump of the model, halving takes up to 60.
+MOST_STEPS = 64
+# Rates between rest and the answer at which the output must rise, or the answer lies on another branch.
+WAYPOINTS = 8
+# A rate lies outside the calibration beyond this many of its standard uncertainties: of a million, none by chance.
+SURELY = 6.0
+# Ranges in files are rounded to ten digits.
+ROUNDING = 1e-9
+
+
+def compensate(campaign: Campaign, calibration: Calibration) -> Campaign:
+    """The campaign with its input rate estimated from the output and the covariates.
+
+    Adds `rate_estimated` and its standard uncertainty `rate_estimated_std` (deg/s). The uncertainty holds the
+    covariance of the fitted parameters and the white noise of one sample, as far as the calibration knows them
+    (metadata `rate_estimated_std_holds`); not flicker and random walk, nor that of parameters held fixed. Both columns
+    are NaN where the output is missing, or where the model gives it at no rate on the branch through rest. Such
+    samples, those outside the calibrated ranges and what else a user must know are counted in the metadata
+    `rate_estimated_note`. A column `rate` is not needed and not used.
+
+    Args:
+        campaign: one axis, with the covariates that the model needs.
+        calibration: of `Estimate.calibration` or `read_calibration`; its reference points are used, not the campaign's.
+
+    Raises:
+        CampaignError: the campaign has several axes.
+        ModelError: the model needs a column that the campaign lacks, or is of other units.
+    """
+    model = calibration.model
+    record = read_signals(campaign)
+    record = record._replace(signals=record.signals | {"rate": jnp.zeros_like(record.signals["time"])})
+    check_covariates(record, model)
+    check_units(model, record.output_unit, record.units)
+    rate, variance = _estimate(calibration, record)
+    notes = _notes(campaign, calibration, record, rate, np.sqrt(variance))
+    campaign = campaign.with_column("rate_estimated", from_internal(rate, "deg/s"), "deg/s")
+    campaign = campaign.with_column("rate_estimated_std", from_internal(np.sqrt(variance), "deg/s"), "deg/s")
+    return campaign.with_metadata({
+        "rate_estimated_std_holds": ", ".join(_held(calibration)) or "nothing",
+        "rate_estimated_note": " ".join(notes) or None,
+    })  # fmt: skip
+
+
+def _held(calibration: Calibration) -> list[str]:
+    """What the standard uncertainty is made of."""
+    fitted = calibration.covariance is not None
+    return ["parameter covariance"] * fitted + ["white noise of one sample"] * bool(calibration.model.noise)
+
+
+def _estimate(calibration: Calibration, record: Record) -> tuple[np.ndarray, np.ndarray]:
+    """Rate and its variance, of real rows; the variance is NaN where neither covariance nor noise is known."""
+    model, covariance = calibration.model, calibration.covariance
+    names = {"time", "time_on", "temperature_rate", "rate", *(n for e in model.effects for n in e.columns_needed)}
+    signals = {name: values for name, values in record.signals.items() if name in names}
+    output = jnp.where(record.sampling.present, record.signals["output"], jnp.nan)
+    white = jnp.asarray(model.noise.get("noise_white", 0.0)) ** 2 / record.interval
+    spread = np.zeros((len(model.slots()),) * 2) if covariance is None else covariance
+    # The whole record at once: effects may look at what came before.
+    found = _solve(model, jnp.asarray(spread), white, signals, output)
+    rate, variance = (np.asarray(values)[: record.rows] for values in found)
+    return rate, variance if _held(calibration) else np.full_like(variance, np.nan)
+
+
+def _notes(
+    campaign: Campaign, calibration: Calibration, record: Record, rate: np.ndarray, std: np.ndarray
+) -> list[str]:
+    """What a user of the estimated rate must know, a sentence each."""
+    model, present, notes = calibration.model, record.present, []
+    if lost := int((present & np.isnan(rate)).sum()):
+        notes.append(
+            f"{lost} of {present.sum()} samples have no estimated rate: on its branch through rest the model gives "
+            "their output at no rate."
+        )
+    for name, (low, high) in calibration.validity.items():
+        unit = VALIDITY_UNITS[name]
+        limits = f"{from_internal(low, unit):.6g} to {from_internal(high, unit):.6g} {unit}"
+        if name != "rate" and name not in campaign.columns:
+            notes.append(f"There is no column {name} to hold against the calibrated range of {limits}.")
+            continue
+        values = rate if name == "rate" else np.asarray(record.signals[name])[: record.rows]
+        margin = SURELY * np.nan_to_num(std) if name == "rate" else ROUNDING * max(abs(low), abs(high))
+        if outside := int((present & ((values < low - margin) | (values > high + margin))).sum()):
+            notes.append(f"{outside} of {present.sum()} samples lie outside the calibrated range of {name}, {limits}.")
+    if timed := [e.label for e in model.effects if "time" in e.columns_needed]:
+        notes.append(f"Time in {', '.join(dict.fromkeys(timed))} counts from the start of this campaign.")
+    if calibration.covariance is None and model.slots():
+        notes.append("The model was not fitted: rate_estimated_std leaves out the uncertainty of its parameters.")
+    if not model.noise:
+        notes.append("The model states no noise: rate_estimated_std leaves it out.")
+    return notes
+
+
+@eqx.filter_jit
+def _solve(
+    model: GyroModel,
+    covariance: Float[Array, "parameter parameter"],
+    white: Float[Array, ""],
+    signals: Signals,
+    output: Float[Array, " sample"],
+) -> tuple[Float[Array, " sample"], Float[Array, " sample"]]:
+    rate = invert(model, signals, output)
+    signals = {**signals, "rate": rate}
+    _, slope = output_and_slope(model, signals)
+    # Implicit function theorem: ∂rate/∂parameter = −(∂output/∂parameter)/(∂output/∂rate).
+    jacobian = model.linearise(signals)[1] / slope[:, None]
+    variance = jnp.sum((jacobian @ covariance) * jacobian, axis=1) + white * (model.gain() / slope) ** 2
+    return rate, jnp.where(jnp.isfinite(rate), variance, jnp.nan)
+
+
+def output_and_slope(model: GyroModel, signals: Signals) -> tuple[Float[Array, " sample"], Float[Array, " sample"]]:
+    """The model's output, and its derivative by the rate of the same sample."""
+    rate = signals["rate"]
+    return jax.jvp(lambda r: model.predict({**signals, "rate": r}), (rate,), (jnp.ones_like(rate),))
+
+
+class _Search(NamedTuple):
+    """Rates under trial, the bracket around each answer, and whether its ends have the output below and above them."""
+
+    rate: Array
+    low: Array
+    high: Array
+    below: Array
+    above: Array
+    found: Array
+    running: Array
+    steps: Array
+
+
+def invert(model: GyroModel, signals: Signals, output: Float[Array, " sample"]) -> Float[Array, " sample"]:
+    """The rate (rad/s) at which the model gives an output, on the branch through rest.
+
+    Newton's method from output/gain, kept between the rates already known to lie below and above the answer. A rate at
+    which the output falls lies beyond a fold, and becomes a wall. Where the output jumps over the measured value, the
+    answer is the rate of the jump.
+
+    Args:
+        model: its output depends on the rate of the same sample only.
+        signals: covariates in internal units; a `rate` is not used.
+        output: internal unit; NaN where missing.
+
+    Returns:
+        The rates; NaN where there is none.
+    """
+    gain = model.gain()
+    target = output / gain
+
+    def advance(s: _Search) -> _Search:
+        value, slope = output_and_slope(model, {**signals, "rate": s.rate})
+        excess, slope = value / gain - target, slope / gain
+        rising = slope > 0
+        short, wall = rising & (excess < 0), ~rising
+        over = rising & ~short
+        low = jnp.where(short | (wall & (s.rate <= 0)), s.rate, s.low)
+        high = jnp.where(over | (wall & (s.rate > 0)), s.rate, s.high)
+        below = jnp.where(low == s.low, s.below, short)
+        above = jnp.where(high == s.high, s.above, over)
+        newton = s.rate - excess / slope
+        size = TOLERANCE * (jnp.abs(s.rate) + jnp.abs(target))
+        close = rising & (jnp.abs(newton - s.rate) <= size)
+        shut = high - low <= size
+        middle = jnp.where(jnp.isfinite(low) & jnp.isfinite(high), (low + high) / 2, s.rate / 2)
+        inside = rising & (newton > low) & (newton < high)
+        rate = jnp.where(close | inside, newton, middle)
+        found = close | (shut & below & above)
+        going = s.running & ~close & ~shut
+        return _Search(
+            jnp.where(s.running, rate, s.rate), low, high, below, above, jnp.where(s.running, found, s.found), going,
+            s.steps + 1,
+        )  # fmt: skip
+
+    never = jnp.zeros(target.shape, bool)
+    start = _Search(
+        target, jnp.full_like(target, -jnp.inf), jnp.full_like(target, jnp.inf), never, never, never,
+        jnp.isfinite(target), jnp.zeros((), int),
+    )  # fmt: skip
+    end = jax.lax.while_loop(lambda s: jnp.any(s.running) & (s.steps < MOST_STEPS), advance, start)
+
+    def climb(k, rising):
+        part = end.rate * k / (WAYPOINTS + 1)
+        return rising & (output_and_slope(model, {**signals, "rate": part})[1] / gain > 0)
+
+    return jnp.where(jax.lax.fori_loop(1, WAYPOINTS + 1, climb, end.found), end.rate, jnp.nan)

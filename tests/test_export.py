@@ -1,0 +1,258 @@
+"""Exported calibrations: the C file, compiled without a warning, against `compensate` on random campaigns for every
+effect of the catalogue; JSON and CSV against the model computed again from their numbers alone."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gyromodel._checks import usual_unit
+from gyromodel.campaign import Campaign
+from gyromodel.compensation import compensate
+from gyromodel.effects import CATALOGUE, Effect, Signals
+from gyromodel.effects.drivers import Bias, BiasColumn, BiasStep
+from gyromodel.effects.scale import ScaleFactor, ScaleNonlinearity, ScaleSagnacSine, ScaleSpline
+from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureCurve, BiasTemperatureRate
+from gyromodel.estimate import Calibration, fit
+from gyromodel.export import export_calibration
+from gyromodel.model import GyroModel, ModelError, make_effect, simulate
+from gyromodel.signals import read_signals
+from gyromodel.units import factor, internal_unit
+from tests.test_c_code import CC, STRICT
+
+ROWS = 150
+LABELS = [*sorted(set(CATALOGUE) - {"bias_column", "scale_factor"}), "bias_supply_voltage"]
+needs_compiler = pytest.mark.skipif(CC is None, reason="no C compiler on this machine")
+SCALE = ScaleFactor(value=jnp.asarray(1500.0), unit="count/rad")
+
+
+def campaign(rng: np.random.Generator, *names: str) -> Campaign:
+    """Counts, with whatever columns effects need."""
+    columns = {"time": np.arange(ROWS) * 20.0, "output": 1500 * rng.uniform(-1.2, 1.2, ROWS)}
+    units = {"time": "s", "output": "count/s"}
+    columns["temperature"], units["temperature"] = 25 + 15 * np.sin(columns["time"] / 300), "degC"
+    for name in set(names) - {"time", "rate", "temperature"}:
+        columns[name], units[name] = rng.uniform(0.5, 1.5, ROWS), usual_unit(name)
+    return Campaign(columns, units, {"kind": "rate", "time_since_power_on": 40.0})
+
+
+def filled(label: str, record_signals: Signals, rng: np.random.Generator) -> Effect:
+    """The effect at random values below its typical sizes."""
+    effect = make_effect(label)
+    if label.endswith("_curve"):
+        effect = type(effect)(coefficients=np.zeros(3), hinges=np.zeros(2), breakpoints=np.array([20.0, 33.0]))  # type: ignore[call-arg]
+    effect = effect.prepared(record_signals)
+    values = {}
+    for name, declared in effect.declared().items():
+        if name not in ("breakpoints", "time_constant", "share"):
+            size = declared.typical * factor(declared.unit, internal_unit(declared.unit)) if declared.linear else 1.0
+            values[name] = size * jnp.asarray(rng.uniform(0.3, 1.0, np.shape(getattr(effect, name))))
+    return replace(effect, **values)
+
+
+def run(source: str, folder: Path, rows: dict[str, np.ndarray]) -> np.ndarray:
+    """Rates that a C program with this header gives for rows of samples, by member of its struct."""
+    members = re.findall(r"^    double (\w+);", source.partition("typedef struct {")[2].partition("}")[0], re.M)
+    (folder / "gyromodel_compensate.h").write_text(source, encoding="utf-8")
+    form, places = json.dumps("%lf" * len(members)), ", ".join(f"&s.{m}" for m in members)
+    program = [
+        '#include "gyromodel_compensate.h"',
+        '#include "gyromodel_compensate.h"',
+        "#include <stdio.h>",
+        "int main(void) {",
+        "    gyromodel_sample s;",
+        f"    while (scanf({form}, {places}) == {len(members)})",
+        '        printf("%.17g\\n", gyromodel_rate(&s));',
+        "    return 0;",
+        "}",
+    ]
+    (folder / "main.c").write_text("\n".join(program), encoding="utf-8")
+    command = [str(CC), *STRICT, "-O1", "-o", str(folder / "main"), str(folder / "main.c"), "-lm"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    text = "\n".join(" ".join(repr(float(rows[m][i])) for m in members) for i in range(len(rows[members[0]])))
+    printed = subprocess.run([str(folder / "main")], input=text, capture_output=True, text=True, check=True).stdout
+    return np.array([float(line) for line in printed.split()])
+
+
+def members_of(measured: Campaign) -> dict[str, np.ndarray]:
+    """Values by the names that the C file gives them."""
+    record = read_signals(measured)
+    values = {name: np.asarray(v)[: record.rows] for name, v in record.signals.items()}
+    named = {
+        "output_count_per_s": values["output"], "time_s": values["time"], "time_on_s": values["time_on"],
+        "temperature_degC": values["temperature"], "temperature_rate_degC_per_s": values["temperature_rate"],
+    }  # fmt: skip
+    for name in measured.covariates:
+        unit = internal_unit(measured.units[name]).replace("/", "_per_").replace("^", "")
+        named[f"{name}_{unit or 'number'}"] = values[name]
+    return named
+
+
+@needs_compiler
+@pytest.mark.parametrize("label", LABELS)
+def test_c_gives_the_rates_of_compensate(label: str, tmp_path: Path, rng: np.random.Generator):
+    measured = campaign(rng, *make_effect(label).columns_needed)
+    signals = read_signals(measured).signals | {"rate": jnp.asarray(rng.uniform(-1.2, 1.2, 192))}
+    model = GyroModel(
+        (SCALE, Bias(value=jnp.asarray(1e-3)), filled(label, signals, rng))
+        if label != "bias"
+        else (SCALE, Bias(value=jnp.asarray(0.1)))
+    )
+    calibration = Calibration(model)
+    expected = compensate(measured, calibration).si("rate_estimated")
+    assert np.isfinite(expected).mean() > 0.9
+    found = run(export_calibration(calibration, "c"), tmp_path, members_of(measured))
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+
+
+def full_model() -> GyroModel:
+    """Effects that take settings, arrays, a repeated label and columns that C cannot name."""
+    return GyroModel(
+        (
+            replace(SCALE, value=jnp.asarray(-1500.0)),
+            Bias(value=jnp.asarray(0.02)),
+            BiasTemperature(coefficient=jnp.asarray(1e-4), reference=jnp.asarray(20.0)),
+            BiasTemperatureRate(coefficient=jnp.asarray(0.3)),
+            ScaleNonlinearity(coefficients=jnp.asarray([0.01, -0.02]), powers=(2, 3), full_rate=jnp.asarray(1.5)),
+            ScaleSagnacSine(kappa=jnp.asarray(0.4)),
+            BiasStep(size=jnp.asarray(0.01), epoch=jnp.asarray(1000.0)),
+            BiasStep(size=jnp.asarray(-0.03), epoch=jnp.asarray(2000.0)),
+            BiasColumn(
+                coefficient=jnp.asarray(1e-2), column="2nd lamp µ", unit="deg/h/(mV)", reference=jnp.asarray(0.5)
+            ),
+        ),
+        {"noise_white": jnp.asarray(1e-4)},
+        frozenset({("bias_temperature", "coefficient")}),
+        "fog */ /*",
+    )
+
+
+@needs_compiler
+def test_a_whole_model_in_c(tmp_path: Path, rng: np.random.Generator):
+    measured = campaign(rng).with_column("2nd lamp µ", rng.uniform(100, 900, ROWS), "mV")
+    output = measured.columns["output"].copy()
+    output[:4] = np.nan, 1e9, -1e9, 0.0
+    measured = measured.with_column("output", output, "count/s")
+    calibration = Calibration(full_model(), validity={"rate": (-1.0, 1.0)}, data_hash="abc")
+    source = export_calibration(calibration, "c")
+    rows = members_of(measured) | {"column_2nd_lamp_V": measured.si("2nd lamp µ")}
+    expected = compensate(measured, calibration).si("rate_estimated")
+    assert np.isnan(expected[:3]).all()
+    np.testing.assert_allclose(run(source, tmp_path, rows), expected, rtol=1e-12, atol=1e-12)
+    assert "const double bias_step_2_epoch = 2000.0; /* 2000 s */" in source
+    assert "Calibrated from -57.2958 to 57.2958 deg/s of rate." in source
+    assert "abc" in source
+
+
+def test_members_are_what_the_model_reads():
+    source = export_calibration(Calibration(GyroModel((SCALE, Bias(value=jnp.asarray(1.0))))), "c")
+    assert re.findall(r"^    double (\w+);.*\n", source.partition("}")[0], re.M) == ["output_count_per_s"]
+
+
+class Remembering(BiasColumn):
+    """A bias that accumulates, as hysteresis does."""
+
+    def columns(self, signals):
+        return jnp.cumsum(signals[self.column])[:, None]
+
+
+class Differencing(BiasColumn):
+    """A bias of the change from the sample before."""
+
+    def columns(self, signals):
+        return jnp.diff(signals[self.column], prepend=0.0)[:, None]
+
+
+@pytest.mark.parametrize(
+    ("kind", "reason"), [(Remembering, "no short form of cumsum"), (Differencing, "other samples")]
+)
+def test_effects_with_memory_are_refused(kind: type[BiasColumn], reason: str):
+    effect = kind(coefficient=jnp.asarray(1.0), column="pressure", reference=jnp.asarray(0.0))
+    with pytest.raises(ModelError, match=f"bias_pressure cannot be exported to C.*{reason}"):
+        export_calibration(Calibration(GyroModel((effect,))), "c")
+
+
+def test_columns_that_c_cannot_tell_apart_are_refused():
+    effects = (BiasColumn(column=name, reference=jnp.asarray(0.0)) for name in ("lamp 1", "lamp.1"))
+    with pytest.raises(ModelError, match="lamp_1_number in C"):
+        export_calibration(Calibration(GyroModel(tuple(effects))), "c")
+
+
+@pytest.fixture
+def fitted(rng: np.random.Generator) -> Calibration:
+    """A fit of scale factor, curved bias and spline over rate and temperature."""
+    design = campaign(rng).with_column("rate", np.rad2deg(rng.uniform(-1.0, 1.3, ROWS)), "deg/s")
+    curve = BiasTemperatureCurve(
+        coefficients=jnp.asarray([2e-3, -1e-3]), hinges=jnp.asarray([5e-4]), breakpoints=jnp.asarray([33.0]),
+        reference=jnp.asarray(25.0),
+    )  # fmt: skip
+    powers = ScaleNonlinearity(coefficients=jnp.asarray([0.01, -0.02]), powers=(2, 3), full_rate=jnp.asarray(1.3))
+    model = GyroModel(
+        (SCALE, curve, powers), {"noise_white": jnp.asarray(1e-3)}, frozenset({(curve.label, "breakpoints")})
+    )
+    return fit(simulate(model, design), model).calibration()
+
+
+def test_json_holds_all_that_the_model_is(fitted: Calibration, rng: np.random.Generator):
+    said = json.loads(export_calibration(fitted, "json"))
+    rate, temperature = rng.uniform(-57, 74, 40), rng.uniform(10, 40, 40)
+    scale, curve, powers = ({p["name"]: p["value"] for p in e["parameters"] + e["settings"]} for e in said["effects"])
+    assert [p["unit"] for e in said["effects"] for p in e["parameters"]] == [
+        "count/deg", "deg/h", "deg/h", "deg/h/degC", "degC", "ppm", "ppm",
+    ]  # fmt: skip
+    # The formula and the equations that the file states, in its units.
+    u = (temperature - curve["reference"]) / 10
+    bias = curve["coefficients[0]"] * u + curve["coefficients[1]"] * u**2
+    bias = (bias + curve["hinges"] * np.maximum(temperature - curve["breakpoints"], 0)) / 3600
+    x = rate / powers["full_rate"]
+    error = 1e-6 * sum(powers[f"coefficients[{i}]"] * x ** (powers[f"powers[{i}]"] - 1) for i in range(2))
+    output = scale["value"] * (rate + bias) * (1 + error)
+    signals = {"rate": np.deg2rad(rate), "temperature": temperature, "time": np.zeros(40)}
+    expected = fitted.model.predict({name: jnp.asarray(values) for name, values in signals.items()})
+    np.testing.assert_allclose(output, expected, rtol=1e-12, atol=1e-9)
+    assert said["formula"].startswith("output = ")
+    assert said["degrees_of_freedom"] == ROWS - 6
+    assert said["validity"]["temperature"]["unit"] == "degC"
+    free = [p["std"] for e in said["effects"] for p in e["parameters"] if not p["fixed"]]
+    assert np.sqrt(np.diag(said["covariance"]["matrix"])) == pytest.approx(free)
+    assert said["covariance"]["units"] == ["count/deg", "deg/h", "deg/h", "deg/h/degC", "ppm", "ppm"]
+    assert len(said["covariance"]["parameters"]) == 6
+
+
+def test_csv_has_a_row_for_each_number(fitted: Calibration):
+    rows = list(csv.DictReader(io.StringIO(export_calibration(fitted, "csv"))))
+    table = {(row.effect, row.name): row for row in fitted.table()}
+    parameters = [row for row in rows if row["kind"] in ("parameter", "fixed")]
+    assert len(parameters) == len(table)
+    for row in parameters:
+        expected = table[row["effect"], row["name"]]
+        assert (float(row["value"]), float(row["std"]), row["unit"]) == expected[2:]
+    assert {row["name"] for row in rows if row["kind"] == "setting"} == {
+        "reference",
+        "full_rate",
+        "powers[0]",
+        "powers[1]",
+    }
+    assert [row["name"] for row in rows if row["kind"] == "fixed"] == ["breakpoints"]
+    noise = next(row for row in rows if row["kind"] == "noise")
+    assert (noise["effect"], noise["unit"], noise["std"]) == ("noise_white", "deg/sqrt(h)", "")
+    assert [row["name"] for row in rows if row["kind"] == "validity"] == ["lowest", "highest"] * 2
+
+
+def test_a_model_that_was_not_fitted_has_no_uncertainty():
+    calibration = Calibration(GyroModel((ScaleSpline(full_rate=jnp.asarray(1.0), lowest=jnp.asarray(-1.0)), SCALE)))
+    said = json.loads(export_calibration(calibration, "json"))
+    assert said["covariance"] is None
+    assert {p["std"] for e in said["effects"] for p in e["parameters"]} == {None}
+    rows = csv.DictReader(io.StringIO(export_calibration(calibration, "csv")))
+    assert {row["std"] for row in rows} == {""}
