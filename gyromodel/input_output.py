@@ -81,7 +81,7 @@ class InputOutputCurve(eqx.Module):
         Raises:
             CurveError: a rate lies outside the rates tested.
         """
-        self._check_inside(rate, self.spline.knots, factor("rad/s", "deg/s"), "rate", "deg/s")
+        self._check_rate(rate)
         return self.spline(rate), self._std(rate, 0)
 
     def scale_factor(self, rate: Float[Array, " point"]) -> tuple[Float[Array, " point"], Float[Array, " point"]]:
@@ -90,7 +90,7 @@ class InputOutputCurve(eqx.Module):
         Raises:
             CurveError: a rate lies outside the rates tested.
         """
-        self._check_inside(rate, self.spline.knots, factor("rad/s", "deg/s"), "rate", "deg/s")
+        self._check_rate(rate)
         return self.spline(rate, 1), self._std(rate, 1)
 
     def rate(
@@ -112,7 +112,7 @@ class InputOutputCurve(eqx.Module):
                 f"the curve is not monotone: its slope runs from {low:.6g} to {high:.6g} per rad/s, so that an output "
                 "can belong to several rates; test more rates where it turns, or smooth the curve"
             )
-        self._check_inside(output, self.spline.values, 1.0, "output", "as the curve's")
+        _check_inside(output, self.spline.values, "output", "")
         rate = _inverse(self.spline, output)
         spread = jnp.hypot(self._std(rate, 0), output_std)
         return rate, spread / jnp.abs(self.spline(rate, 1))
@@ -129,27 +129,29 @@ class InputOutputCurve(eqx.Module):
         by_knot = spline_matrix(self.spline.knots, rate, "natural", order)
         return jnp.sqrt(jnp.einsum("pi,ij,pj->p", by_knot, self.covariance, by_knot))
 
-    @staticmethod
-    def _check_inside(values, known, scale: float, what: str, unit: str) -> None:
-        low, high = float(known.min()) * scale, float(known.max()) * scale
-        given = np.ravel(np.asarray(values)) * scale
-        # A rounding of the unit's conversion is no step outside.
-        slack = 1e-12 * max(abs(low), abs(high))
-        outside = given[~((given >= low - slack) & (given <= high + slack))]
-        if len(outside):
-            raise CurveError(
-                f"{what} {outside[0]:.10g} is outside the curve, which was tested from {low:.10g} to {high:.10g} "
-                f"({unit}): a spline says nothing beyond its points"
-            )
+    def _check_rate(self, rate: Float[Array, " point"]) -> None:
+        scale = factor("rad/s", "deg/s")
+        _check_inside(rate * scale, self.spline.knots * scale, "rate", " deg/s")
 
 
-def _increasing(rate, output, fewest: int) -> np.ndarray:
+def _check_inside(values: Array, tested: Array, what: str, unit: str) -> None:
+    """Refuse values outside those tested; a rounding of the unit's conversion is no step outside."""
+    values, low, high = np.asarray(values), float(tested.min()), float(tested.max())
+    slack = 1e-12 * max(abs(low), abs(high))
+    outside = values[~((values >= low - slack) & (values <= high + slack))]
+    if len(outside):
+        raise CurveError(
+            f"{what} {outside[0]:.10g}{unit} is outside the curve, which was tested from {low:.10g} to {high:.10g}{unit}: "
+            "a spline says nothing beyond its points"
+        )
+
+
+def _increasing(rate: Array, output: Array, fewest: int) -> np.ndarray:
     """The order of increasing rate; refuses what makes no curve."""
-    rate, output = np.asarray(rate), np.asarray(output)
-    if not (np.isfinite(rate).all() and np.isfinite(output).all()):
+    if not (jnp.isfinite(rate).all() and jnp.isfinite(output).all()):
         raise CurveError("a test point is not a finite number: leave it out")
-    order = np.argsort(rate)
-    if len(rate) < fewest or (np.diff(rate[order]) <= 0).any():
+    order = np.argsort(np.asarray(rate))
+    if len(order) < fewest or (jnp.diff(rate[order]) <= 0).any():
         raise CurveError(f"a curve needs {fewest} or more different rates: average the readings of each rate first")
     return order
 
