@@ -18,6 +18,9 @@ from gyromodel.units import factor
 # Halvings of the interval between two knots, then Newton steps: together exact to rounding.
 HALVINGS, NEWTON_STEPS = 30, 3
 
+# Points beyond those that the curve uses up; fewer tell no scatter.
+FEWEST_LEFT = 3.0
+
 
 class CurveError(ValueError):
     """The curve cannot answer; the message says why."""
@@ -59,20 +62,29 @@ class InputOutputCurve(eqx.Module):
         cls,
         rate: Float[Array, " knot"],
         output: Float[Array, " knot"],
-        weights: Float[Array, " knot"] | None = None,
+        output_std: Float[Array, " knot"] | None = None,
     ) -> InputOutputCurve:
-        """The smoothing spline over averaged test points; its smoothness and the points' scatter are estimated.
+        """The smoothing spline over averaged test points, its smoothness estimated.
 
         Args:
             rate: four or more different rates, rad/s, in any order.
             output: mean output at each.
-            weights: inverse variances of the means up to a common factor, e.g. how many readings each averages.
+            output_std: standard uncertainty of each mean; estimated, alike for all, if not given.
 
         Raises:
-            CurveError: a rate stands twice, or a number is not finite.
+            CurveError: a rate stands twice, a number is not finite, or the points alone do not tell their scatter.
         """
         order = _increasing(rate, output, fewest=4)
-        fit = smoothing_spline(rate[order], output[order], None if weights is None else weights[order])
+        if output_std is not None:
+            fit = smoothing_spline(rate[order], output[order], output_std[order] ** -2.0, variance=jnp.ones(()))
+            return cls(fit.spline, fit.covariance)
+        fit = smoothing_spline(rate[order], output[order])
+        left = len(order) - float(fit.degrees_of_freedom)
+        if left < FEWEST_LEFT:
+            raise CurveError(
+                f"the smoothest likely curve leaves {left:.1f} of {len(order)} points to tell their scatter from: give "
+                "output_std, e.g. from repeated readings, or test more rates"
+            )
         return cls(fit.spline, fit.covariance)
 
     def output(self, rate: Float[Array, " point"]) -> tuple[Float[Array, " point"], Float[Array, " point"]]:

@@ -183,18 +183,21 @@ def smoothing_spline(
     values: Float[Array, " point"],
     weights: Float[Array, " point"] | None = None,
     smoothness: Float[Array, ""] | None = None,
+    variance: Float[Array, ""] | None = None,
 ) -> SmoothingSpline:
     """The natural cubic smoothing spline, its smoothness by restricted maximum likelihood.
 
     As a mixed model, f is a line plus an integrated random walk of variance σ²/λ. What a line cannot change, Qᵀy, has
     covariance σ²(QᵀW⁻¹Q + R/λ), and its likelihood is the restricted one. Both matrices are diagonalised together once,
-    O(n³): a second at some hundred points.
+    O(n³): a second at some hundred points. With few points and σ² unknown, the likelihood can be greatest where the
+    curve takes all scatter for its own and σ² vanishes: `degrees_of_freedom` is then near n.
 
     Args:
         points: abscissae, four or more, strictly increasing; not checked. Average repeated points first, and weigh them.
         values: ordinates.
         weights: inverse variances up to a common factor, ones if not given.
         smoothness: λ to use instead of estimating it.
+        variance: σ² to use instead of estimating it.
 
     Source: Green & Silverman, Nonparametric Regression and Generalized Linear Models, 1994, §2.1 and 2.3 (Q, R);
         Wecker & Ansley, J. Am. Stat. Assoc. 78, 1983 (restricted likelihood).
@@ -219,26 +222,27 @@ def smoothing_spline(
     log_det_q = jnp.linalg.slogdet(q.T @ q)[1]
 
     def profile(log_ratio):
-        """ln of the restricted likelihood, σ² at its best for a ratio of walk to noise, and that σ²."""
+        """ln of the restricted likelihood for a ratio of walk to noise, and the best σ² for it where that is free."""
         spread = d + jnp.exp(log_ratio)
-        variance = jnp.mean(contrasts**2 / spread)
+        mean = jnp.mean(contrasts**2 / spread)
+        scatter = mean if variance is None else variance
         determinant = jnp.sum(jnp.log(spread)) + log_det_r - log_det_q
-        return -0.5 * ((count - 2) * (jnp.log(2.0 * jnp.pi * variance) + 1.0) + determinant), variance
+        return -0.5 * ((count - 2) * (jnp.log(2.0 * jnp.pi * scatter) + mean / scatter) + determinant), scatter
 
     if smoothness is None:
         log_ratio = _maximum(lambda x: profile(x)[0], jnp.log(d[-1] / BEYOND), jnp.log(d[0] * BEYOND))
     else:
         log_ratio = jnp.log(unit**3 / smoothness)
-    likelihood, variance = profile(log_ratio)
+    likelihood, scatter = profile(log_ratio)
     ratio = jnp.exp(log_ratio)
     # f = y − W⁻¹Q (QᵀW⁻¹Q + R/λ)⁻¹ Qᵀy
     pull = noise[:, None] * basis.T
     fitted = values - pull @ (contrasts / (d + ratio))
-    covariance = variance * (jnp.diag(noise) - (pull / (d + ratio)) @ pull.T)
+    covariance = scatter * (jnp.diag(noise) - (pull / (d + ratio)) @ pull.T)
     return SmoothingSpline(
         cubic_spline(points, fitted),
         covariance,
-        variance,
+        scatter,
         unit**3 / ratio,
         2.0 + jnp.sum(ratio / (d + ratio)),
         likelihood,
