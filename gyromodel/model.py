@@ -22,7 +22,6 @@ from gyromodel.numerics.state_space import build_filter, colour
 from gyromodel.signals import Record, read_signals
 from gyromodel.units import convertible, from_internal
 
-
 # A local slope below this part of the gain is a dead band's.
 DEAD = 0.05
 

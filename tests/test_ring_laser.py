@@ -124,7 +124,9 @@ def sweep(beat: np.ndarray, rate: np.ndarray, noise: float, rng: np.random.Gener
     """A slow sweep of a ring laser of scale factor 1.0005 and bias 3 arcsec/s, in arcsec/s."""
     output = (1.0005 * (beat + 3 * ARCSEC) + noise * ARCSEC * rng.standard_normal(len(rate))) / ARCSEC
     columns = {"time": 8.0 * np.arange(len(rate)), "rate": rate / ARCSEC, "output": output}
-    return gm.Campaign(columns, {"time": "s", "rate": "arcsec/s", "output": "arcsec/s"}, {"kind": "rate", "gyro": "rlg"})
+    return gm.Campaign(
+        columns, {"time": "s", "rate": "arcsec/s", "output": "arcsec/s"}, {"kind": "rate", "gyro": "rlg"}
+    )
 
 
 def up_and_down(top: float, count: int) -> np.ndarray:

@@ -107,7 +107,9 @@ class LockInDithered(Effect):
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """The errors of all bands together."""
         order = jnp.arange(-self.harmonics, self.harmonics + 1)
-        half_width = self.lock_in_rate * jnp.abs(bessel(order, 2.0 * jnp.pi * self.dither_amplitude / self.fringe_angle))
+        half_width = self.lock_in_rate * jnp.abs(
+            bessel(order, 2.0 * jnp.pi * self.dither_amplitude / self.fringe_angle)
+        )
         places = order * self.dither_frequency * self.fringe_angle
         away = (signals["rate"] - self.centre)[:, None] - places
         return stack(lock_in_error(away, half_width).sum(axis=1))
