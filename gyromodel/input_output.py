@@ -148,13 +148,14 @@ class InputOutputCurve(eqx.Module):
 
 def _check_inside(values: Array, tested: Array, what: str, unit: str) -> None:
     """Refuse values outside those tested; a rounding of the unit's conversion is no step outside."""
-    values, low, high = np.asarray(values), float(tested.min()), float(tested.max())
+    low, high = float(tested.min()), float(tested.max())
     slack = 1e-12 * max(abs(low), abs(high))
-    outside = values[~((values >= low - slack) & (values <= high + slack))]
+    given = np.asarray(values)
+    outside = given[~((given >= low - slack) & (given <= high + slack))]
     if len(outside):
         raise CurveError(
-            f"{what} {outside[0]:.10g}{unit} is outside the curve, which was tested from {low:.10g} to {high:.10g}{unit}: "
-            "a spline says nothing beyond its points"
+            f"{what} {outside[0]:.10g}{unit} is outside the curve, which was tested from {low:.10g} to {high:.10g}"
+            f"{unit}: a spline says nothing beyond its points"
         )
 
 

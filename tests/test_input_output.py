@@ -83,7 +83,7 @@ def test_few_points_do_not_tell_their_own_scatter() -> None:
 
 
 def test_a_curve_that_turns_between_its_points_is_refused() -> None:
-    """The points rise, and the spline through them falls between 2 and 3 rad/s: no sample of the slope at knots shows it."""
+    """The points rise, the spline falls between 2 and 3 rad/s: the slope at the knots does not show it."""
     rate, output = jnp.arange(6.0), jnp.array([0.0, 2.0, 6.0, 6.1, 10.0, 12.0])
     curve = InputOutputCurve.through(rate, output)
     slope = CubicSpline(np.arange(6.0), np.asarray(output), bc_type="natural").derivative()

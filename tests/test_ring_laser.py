@@ -1,8 +1,8 @@
 """The ring laser gyro: the published table and its printed spline, and lock-in against the integrated beat phase.
 
 Expected numbers: what the publication prints, and what a check of it found (the second differences and the spline's
-k_i solved by hand from the published equations, slope jumps, distances); tests/truth/ring_laser.py, which integrates the
-beat-phase equation and counts fringes; scipy's Bessel functions.
+k_i solved by hand from the published equations, slope jumps, distances); tests/truth/ring_laser.py, which integrates
+the beat-phase equation and counts fringes; scipy's Bessel functions.
 """
 
 from __future__ import annotations

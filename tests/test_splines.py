@@ -1,8 +1,8 @@
 """Splines against scipy's, and the smoothing spline against its mixed model written out densely.
 
 Expected numbers: scipy.interpolate.CubicSpline and make_smoothing_spline on the same input; a line plus an integrated
-Wiener process with its covariance min²(3 max − min)/6, its restricted likelihood maximised by scipy.optimize; draws from
-that process for the coverage of intervals; finite differences.
+Wiener process with its covariance min²(3 max − min)/6, its restricted likelihood maximised by scipy.optimize; draws
+from that process for the coverage of intervals; finite differences.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ def walk_covariance(x: np.ndarray) -> np.ndarray:
 
 
 def dense_reml(x: np.ndarray, y: np.ndarray, w: np.ndarray, smoothness: float):
-    """Log restricted likelihood with σ² profiled out, σ², and the posterior of the curve, from the textbook formulas."""
+    """Log restricted likelihood with σ² profiled out, σ², and the curve's posterior, from the textbook formulas."""
     n, line = len(x), np.column_stack([np.ones_like(x), x])
     walk = walk_covariance(x) / smoothness
     v = np.diag(1 / w) + walk

@@ -1,8 +1,7 @@
 """Readout effects: the lock-in of a ring laser, bare and under dither.
 
-The beat phase ψ of two counter-propagating beams that scatter into one another follows, in case angle,
-dψ/dt = (2π/S)·(ω − ω_L sin ψ): S is the angle of one fringe, ω_L the lock-in rate. Source: Aronowitz, *Fundamentals of
-the Ring Laser Gyro*, in RTO AGARDograph 339, Optical Gyros and their Application, 1999.
+Source: Aronowitz, *Fundamentals of the Ring Laser Gyro*, in RTO AGARDograph 339, Optical Gyros and their Application,
+1999.
 """
 
 from __future__ import annotations
@@ -17,12 +16,14 @@ from jaxtyping import Array, Float, Int
 
 from gyromodel.effects._base import Effect, Signals, parameter, stack
 
-# A wider dead band (rad/s) is not that of a ring laser, and a centre is off by no more than the Earth's rate and a bias.
+# A wider dead band (rad/s) is no ring laser's, and its centre is off by no more than the Earth's rate and a bias.
 WIDEST, FARTHEST = np.deg2rad(1.0), np.deg2rad(20.0 / 3600.0)
 # Different rates that must lie inside the narrowest dead band searched; fewer are single bad points.
 FEWEST_INSIDE = 3
-# Half widths searched, this far apart at most as a factor down to this part of the widest; centres a half width apart.
+# How many half widths are searched, down to what part of the widest.
 WIDTHS, NARROWEST = 20, 1.0 / 300.0
+# Centres searched, in half widths.
+CENTRES = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
 # Points of the integral for Bessel functions: exact to rounding while argument plus order stay below this number.
 BESSEL_POINTS = 4096
 
@@ -30,8 +31,9 @@ BESSEL_POINTS = 4096
 class LockIn(Effect):
     """E += B(ω − ω_c) − (ω − ω_c), with B(v) = sgn v √(v² − ω_L²), 0 inside ±ω_L: lock-in.
 
-    B is the mean over a beat of dψ/dt·S/2π above. Far from the dead band nothing is left of it, so bias and scale factor
-    keep their meaning. The search lets a share of it vary to have a linear coefficient; the fit holds it at one.
+    Two beams that scatter into one another beat at dψ/dt = (2π/S)·(ω − ω_L sin ψ), S the angle of one fringe; B is the
+    mean of that, as a rate. Far from rest it is ω, so bias and scale factor keep their meaning. The search lets a share
+    of the effect vary to have a linear coefficient; the fit holds it at one.
     """
 
     id = "lock_in"
@@ -71,20 +73,21 @@ class LockIn(Effect):
         narrowest = max(levels[FEWEST_INSIDE - 1], NARROWEST * widest)
         if not narrowest < widest:
             return []
-        steps = np.arange(-2, 3) / 2.0
         return [
-            cls(half_width=width, centre=step * width)
-            for width in np.geomspace(narrowest, widest, WIDTHS)
-            for step in steps[np.abs(steps) * width <= FARTHEST]
+            cls(half_width=half_width, centre=centre)
+            for half_width in np.geomspace(narrowest, widest, WIDTHS)
+            for centre in CENTRES * half_width
+            if abs(centre) <= FARTHEST
         ]
 
 
 class LockInDithered(Effect):
     """E += Σ_m [B_m(v_m) − v_m], v_m = ω − ω_c − m f S: dead bands left by a sinusoidal dither, at rest and harmonics.
 
-    B_m is the B of lock_in, its half width ω_L·|J_m(2πθ_D/S)|. With the case dithered by θ_D sin 2πft, ψ = φ + β sin 2πft and β = 2πθ_D/S, the beat equation becomes
-    dφ/dt = (2π/S)·(ω − ω_L Σ_m J_m(β) sin(φ + 2πmft)) (Jacobi and Anger). Where ω is near −m f S, term m alone is slow,
-    and locks as a bare ring laser of lock-in rate ω_L·|J_m(β)| does. First order in ω_L/(f S).
+    B_m is the B of lock_in with half width ω_L·|J_m(β)|, β = 2πθ_D/S. With the case dithered by θ_D sin 2πft and
+    ψ = φ + β sin 2πft, the beat equation of lock_in becomes (Jacobi and Anger)
+    dφ/dt = (2π/S)·(ω − ω_L Σ_m J_m(β) sin(φ + 2πmft)). Where ω is near −m f S, term m alone is slow, and locks as a
+    bare ring laser would. First order in ω_L/(f S); `harmonics` is the largest m.
     """
 
     id = "lock_in_dithered"
@@ -107,9 +110,8 @@ class LockInDithered(Effect):
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """The errors of all bands together."""
         order = jnp.arange(-self.harmonics, self.harmonics + 1)
-        half_width = self.lock_in_rate * jnp.abs(
-            bessel(order, 2.0 * jnp.pi * self.dither_amplitude / self.fringe_angle)
-        )
+        depth = 2.0 * jnp.pi * self.dither_amplitude / self.fringe_angle
+        half_width = self.lock_in_rate * jnp.abs(bessel(order, depth))
         places = order * self.dither_frequency * self.fringe_angle
         away = (signals["rate"] - self.centre)[:, None] - places
         return stack(lock_in_error(away, half_width).sum(axis=1))

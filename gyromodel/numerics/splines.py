@@ -1,7 +1,7 @@
 """Cubic splines through points in Newton form, and the smoothing spline of greatest restricted likelihood.
 
-A spline P is held by its values and by half its second derivatives k_i = P''(x_i)/2 at the knots. Source of the form and
-of the equations: Yang Heng et al., Aviation Metrology & Measurement Technology 19(3), 1999.
+A spline P is held by its values and by half its second derivatives k_i = P''(x_i)/2 at the knots. Source of the form
+and of the equations: Yang Heng et al., Aviation Metrology & Measurement Technology 19(3), 1999.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ GOLDEN_STEPS = 40
 class CubicSpline(eqx.Module):
     """A piecewise cubic given by values and half second derivatives at its knots; leading axes of both are batches.
 
-    Beyond its knots it continues as the straight line of its end's value and slope if `straight_ends`, else as the cubic
-    of its last interval.
+    Beyond its knots it continues as the straight line of its end's value and slope if `straight_ends`, else as the
+    cubic of its last interval.
     """
 
     knots: Float[Array, " knot"]
@@ -193,7 +193,7 @@ def smoothing_spline(
     curve takes all scatter for its own and σ² vanishes: `degrees_of_freedom` is then near n.
 
     Args:
-        points: abscissae, four or more, strictly increasing; not checked. Average repeated points first, and weigh them.
+        points: abscissae, four or more, strictly increasing; not checked. Average repeated points, and weigh them.
         values: ordinates.
         weights: inverse variances up to a common factor, ones if not given.
         smoothness: λ to use instead of estimating it.

@@ -1,8 +1,8 @@
 """A ring laser by its beat-phase equation, integrated and counted.
 
-dψ/dt = K(ω + dθ/dt − ω_L sin ψ), K = 2π/S: the phase of the beat, the case turning at ω and dithered by θ(t). Integrated
-as φ = ψ − Kθ, which the fast dither leaves smooth, by classical Runge-Kutta steps. All lanes (rates, or repetitions of
-one) run side by side. Angles in rad, rates in rad/s.
+dψ/dt = K(ω + dθ/dt − ω_L sin ψ), K = 2π/S: the phase of the beat, the case turning at ω and dithered by θ(t).
+Integrated as φ = ψ − Kθ, which the fast dither leaves smooth, by classical Runge-Kutta steps. All lanes (rates, or
+repetitions of one) run side by side. Angles in rad, rates in rad/s.
 """
 
 from __future__ import annotations
