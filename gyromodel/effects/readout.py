@@ -126,7 +126,7 @@ def lock_in_error(rate: Float[Array, "*shape"], lock_in_rate: Float[Array, "*#sh
     """B(ω) − ω: mean beat of a ring laser, as a rate, less the rate; −ω inside the dead band."""
     excess = rate**2 - lock_in_rate**2
     free = excess > 0
-    # ω is taken from the root in a form that loses no digits far from rest, and has no infinite slope inside.
+    # √(ω² − ω_L²) − ω = −ω_L²/(√(ω² − ω_L²) + ω) loses no digits far from rest; the guards keep derivatives finite.
     root = jnp.sqrt(jnp.where(free, excess, 1.0))
     return jnp.where(free, -(lock_in_rate**2) / jnp.where(free, rate + jnp.sign(rate) * root, 1.0), -rate)
 
