@@ -17,7 +17,6 @@ from gyromodel.units import factor
 
 # Halvings of the interval between two knots, then Newton steps: together exact to rounding.
 HALVINGS, NEWTON_STEPS = 30, 3
-
 # Points beyond those that the curve uses up; fewer tell no scatter.
 FEWEST_LEFT = 3.0
 
@@ -139,7 +138,8 @@ class InputOutputCurve(eqx.Module):
 
     def _std(self, rate: Float[Array, " point"], order: int) -> Float[Array, " point"]:
         by_knot = spline_matrix(self.spline.knots, rate, "natural", order)
-        return jnp.sqrt(jnp.einsum("pi,ij,pj->p", by_knot, self.covariance, by_knot))
+        variance = jnp.einsum("pi,ij,pj->p", by_knot, self.covariance, by_knot)
+        return jnp.sqrt(jnp.maximum(variance, 0.0))  # rounding can take a zero below it
 
     def _check_rate(self, rate: Float[Array, " point"]) -> None:
         scale = factor("rad/s", "deg/s")

@@ -1,7 +1,7 @@
 """Readout effects: the lock-in of a ring laser, bare and under dither.
 
-Source: Aronowitz, *Fundamentals of the Ring Laser Gyro*, in RTO AGARDograph 339, Optical Gyros and their Application,
-1999.
+Source of the beat equation: Aronowitz, *Fundamentals of the Ring Laser Gyro*, in RTO AGARDograph 339, Optical Gyros and
+their Application, 1999. What follows from it is derived below, and held in the tests to its numerical integration.
 """
 
 from __future__ import annotations
@@ -149,6 +149,7 @@ def dither_random_walk(lock_in_rate: float, fringe_angle: float, peak_dither_rat
         fringe_angle: S, rad.
         peak_dither_rate: Ω_D = 2πf θ_D, rad/s.
 
-    Source: the formula is Aronowitz's (1999, section on random walk by lock-in).
+    Returns:
+        rad/√s; times √t the standard deviation of the angle after a time t.
     """
     return lock_in_rate * math.sqrt(fringe_angle / (2.0 * math.pi * peak_dither_rate))
