@@ -22,6 +22,9 @@ from gyromodel.numerics.state_space import build_filter, colour
 from gyromodel.signals import Record, read_signals
 from gyromodel.units import convertible, from_internal
 
+# A local slope below this part of the gain is a dead band's.
+DEAD = 0.05
+
 
 class ModelError(ValueError):
     """A model that cannot be built or does not fit the campaign; the message says what to change."""
@@ -151,11 +154,16 @@ class GyroModel(eqx.Module):
         return gain * rate * scale
 
     def slope(self, signals: Signals) -> Float[Array, " sample"]:
-        """Derivative of the output by the input rate at each sample: what turns an output error into a rate error."""
+        """Derivative of the output by the input rate at each sample: what turns an output error into a rate error.
+
+        Where the output hardly follows the rate, as in a dead band, no output error is a rate error: there it is the
+        gain.
+        """
         if "rate" not in signals:
             return jnp.full_like(signals["time"], self.gain())
         rate = signals["rate"]
-        return jax.jvp(lambda r: self.predict({**signals, "rate": r}), (rate,), (jnp.ones_like(rate),))[1]
+        slope = jax.jvp(lambda r: self.predict({**signals, "rate": r}), (rate,), (jnp.ones_like(rate),))[1]
+        return jnp.where(jnp.abs(slope) < DEAD * jnp.abs(self.gain()), self.gain(), slope)
 
     def columns_of(self, effect: Effect, signals: Signals) -> Float[Array, "sample coefficient"]:
         """Derivative of the output by an effect's linear coefficients, as it stands in this model or were it added."""

@@ -25,6 +25,7 @@ from gyromodel.units import convertible, factor, internal_unit, parse, quantity
 ROWS = 64
 LABELS = [*sorted(set(CATALOGUE) - {"bias_column"}), "bias_pressure"]
 DEG_H = np.pi / 180 / 3600
+BAND = 30 * 0.519147497289467
 
 
 def signals_of(rng: np.random.Generator) -> dict[str, jax.Array]:
@@ -215,6 +216,30 @@ BY_HAND = [
         {"temperature": [30.0, 10.0]},
         [15.0, -5.0],
     ),
+    (
+        "lock_in",
+        {"share": "1", "half_width": "30 deg/h", "centre": "-10 deg/h"},
+        {"rate": [x * DEG_H for x in (-60.0, -20.0, 0.0, 24.0)]},
+        [50.0 - 40.0, 10.0, -10.0, 16.0 - 34.0],
+    ),
+    (
+        # J_0(β) = 0 at β = 2.404825557695773, where J_1 = 0.519147497289467: nothing at rest, a half width of
+        # 30 × 0.519 deg/h around ±800 deg/h; the last rate is 5/3 of it away, the far band is felt a little.
+        "lock_in_dithered",
+        {
+            "share": "1",
+            "lock_in_rate": "30 deg/h",
+            "dither_amplitude": f"{2.404825557695773 / np.pi} arcsec",
+            "dither_frequency": "400 Hz",
+            "fringe_angle": "2 arcsec",
+        },
+        {"rate": [x * DEG_H for x in (0.0, 810.0, 800.0 + BAND * 5 / 3)]},
+        [
+            0.0,
+            -10.0 + np.sqrt(1610.0**2 - BAND**2) - 1610.0,
+            -BAND / 3 + np.sqrt((1600.0 + BAND * 5 / 3) ** 2 - BAND**2) - (1600.0 + BAND * 5 / 3),
+        ],
+    ),
 ]
 
 
@@ -229,6 +254,7 @@ def internal(written: str | list[str]) -> np.ndarray:
 def test_equation_by_hand(label: str, fields: dict[str, str], columns: dict[str, list[float]], expected: list[float]):
     effect = make_effect(label)
     extra = {"column": "pressure"} if label == "bias_pressure" else {}
+    extra = {"harmonics": 1} if label == "lock_in_dithered" else extra
     effect = type(effect)(**{k: jnp.asarray(internal(v)) for k, v in fields.items()}, **extra)
     signals = {"time": jnp.zeros(len(expected))} | {k: jnp.asarray(v) for k, v in columns.items()}
     unit = DEG_H if effect.site == "rate" else 1e-6
@@ -265,7 +291,7 @@ def test_spline_columns_are_natural_cubic_splines(low: float, high: float, knots
     assert slopes[-1] == pytest.approx(0.0, abs=1e-12)
 
 
-@pytest.mark.parametrize("label", ["scale_nonlinearity", "scale_spline", "scale_sagnac_sine"])
+@pytest.mark.parametrize("label", ["scale_nonlinearity", "scale_spline", "scale_sagnac_sine", "lock_in"])
 def test_gyro_at_rest_gives_finite_columns(label: str):
     still = {"rate": jnp.zeros(ROWS), "time": jnp.zeros(ROWS), "temperature": jnp.zeros(ROWS)}
     columns = np.asarray(make_effect(label).prepared(still).columns(still))

@@ -82,7 +82,7 @@ def build_bank(record: Record) -> Bank:
         else:
             forms = kind.candidates(signals)
             if not forms:
-                not_testable[name] = "its driver does not vary"
+                not_testable[name] = kind.untested
             blocks.extend((name, "effect", _weighted(e, signals, rate), e) for e in forms)
     plain = [n for n in driver_names(record) if n not in OWN_EFFECTS]
     for name in record.signals:

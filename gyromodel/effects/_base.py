@@ -60,7 +60,7 @@ class Effect(eqx.Module):
     without it.
     `supersedes` lists effects that this one contains as a special case; `held` the fields that physics
     or the search fixes; `positive` says that the (only) coefficient cannot be negative; `scan` names a fast search over
-    every epoch or frequency.
+    every epoch or frequency; `untested` says why a campaign leaves it no `candidates`.
     """
 
     id: ClassVar[str]
@@ -72,6 +72,7 @@ class Effect(eqx.Module):
     held: ClassVar[tuple[str, ...]] = ()
     positive: ClassVar[bool] = False
     scan: ClassVar[Literal["", "step", "line"]] = ""
+    untested: ClassVar[str] = "its driver does not vary"
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)

@@ -15,6 +15,8 @@ PHRASES = {
     "scale_sagnac_sine": "a sine-shaped response to rate (open-loop Sagnac phase)",
     "scale_temperature": "a scale factor that changes with temperature",
     "scale_temperature_curve": "a scale factor that curves with temperature",
+    "lock_in": "lock-in: a dead band around rest",
+    "lock_in_dithered": "lock-in under dither: dead bands at rest and at harmonics of the dither",
     "bias": "a constant bias",
     "bias_temperature": "a bias proportional to temperature",
     "bias_temperature_curve": "a bias that curves with temperature",
