@@ -25,6 +25,8 @@ from gyromodel.units import from_internal
 TOLERANCE = 1e-9
 # Newton needs 3 to 6 steps; next to a fold or a jump of the model, halving takes up to 60.
 MOST_STEPS = 64
+# A slope this small, of the gain, is level: the dead band of a lock-in, which has rates of equal output and is no fold.
+LEVEL = 1e-3
 # Rates between rest and the answer at which the output must rise, or the answer lies on another branch.
 WAYPOINTS = 8
 # A rate lies outside the calibration beyond this many of its standard uncertainties: of a million, none by chance.
@@ -125,10 +127,15 @@ def _solve(
 ) -> tuple[Float[Array, " sample"], Float[Array, " sample"]]:
     rate = invert(model, signals, output)
     signals = {**signals, "rate": rate}
-    _, slope = output_and_slope(model, signals)
+    gain, (_, slope) = model.gain(), output_and_slope(model, signals)
+    slope = jnp.where(slope / gain > LEVEL, slope, gain)
     # Implicit function theorem: ∂rate/∂parameter = −(∂output/∂parameter)/(∂output/∂rate).
     jacobian = model.linearise(signals)[1] / slope[:, None]
-    variance = jnp.sum((jacobian @ covariance) * jacobian, axis=1) + white * (model.gain() / slope) ** 2
+    # Where the output jumps or hardly follows the rate, no slope says how far noise reaches: two standard deviations do.
+    noise = jnp.sqrt(white) * gain
+    reach = (invert(model, signals, output + 2 * noise, rate) - invert(model, signals, output - 2 * noise, rate)) / 4
+    reach = jnp.where(jnp.isfinite(reach), reach, noise / slope)
+    variance = jnp.sum((jacobian @ covariance) * jacobian, axis=1) + reach**2
     return rate, jnp.where(jnp.isfinite(rate), variance, jnp.nan)
 
 
@@ -151,17 +158,20 @@ class _Search(NamedTuple):
     steps: Array
 
 
-def invert(model: GyroModel, signals: Signals, output: Float[Array, " sample"]) -> Float[Array, " sample"]:
+def invert(
+    model: GyroModel, signals: Signals, output: Float[Array, " sample"], near: Float[Array, " sample"] | None = None
+) -> Float[Array, " sample"]:
     """The rate (rad/s) at which the model gives an output, on the branch through rest.
 
-    Newton's method from output/gain, kept between the rates already known to lie below and above the answer. A rate at
-    which the output falls lies beyond a fold, and becomes a wall. Where the output jumps over the measured value, the
-    answer is the rate of the jump.
+    Newton's method, kept between the rates already known to lie below and above the answer. A rate at which the output
+    falls lies beyond a fold, and becomes a wall. Where the output jumps over the measured value, the answer is the rate
+    of the jump; where it is level and equal to it, any of those rates.
 
     Args:
         model: its output depends on the rate of the same sample only.
         signals: covariates in internal units; a `rate` is not used.
         output: internal unit; NaN where missing.
+        near: where to begin; output/gain if not given.
 
     Returns:
         The rates; NaN where there is none.
@@ -172,16 +182,18 @@ def invert(model: GyroModel, signals: Signals, output: Float[Array, " sample"]) 
     def advance(s: _Search) -> _Search:
         value, slope = output_and_slope(model, {**signals, "rate": s.rate})
         excess, slope = value / gain - target, slope / gain
-        rising = slope > 0
+        rising, steep = slope > -LEVEL, slope > LEVEL
         short, wall = rising & (excess < 0), ~rising
         over = rising & ~short
         low = jnp.where(short | (wall & (s.rate <= 0)), s.rate, s.low)
         high = jnp.where(over | (wall & (s.rate > 0)), s.rate, s.high)
         below = jnp.where(low == s.low, s.below, short)
         above = jnp.where(high == s.high, s.above, over)
-        newton = s.rate - excess / slope
+        # On level ground twice as far out each time.
+        far = jnp.sign(excess) * jnp.maximum(jnp.abs(excess), jnp.abs(s.rate))
+        newton = s.rate - jnp.where(steep, excess / slope, far)
         size = TOLERANCE * (jnp.abs(s.rate) + jnp.abs(target))
-        close = rising & (jnp.abs(newton - s.rate) <= size)
+        close = rising & (jnp.abs(newton - s.rate) <= size) & (steep | (jnp.abs(excess) <= size))
         shut = high - low <= size
         middle = jnp.where(jnp.isfinite(low) & jnp.isfinite(high), (low + high) / 2, s.rate / 2)
         inside = rising & (newton > low) & (newton < high)
@@ -194,14 +206,15 @@ def invert(model: GyroModel, signals: Signals, output: Float[Array, " sample"]) 
         )  # fmt: skip
 
     never = jnp.zeros(target.shape, bool)
+    begin = target if near is None else near
     start = _Search(
-        target, jnp.full_like(target, -jnp.inf), jnp.full_like(target, jnp.inf), never, never, never,
-        jnp.isfinite(target), jnp.zeros((), int),
+        begin, jnp.full_like(target, -jnp.inf), jnp.full_like(target, jnp.inf), never, never, never,
+        jnp.isfinite(target) & jnp.isfinite(begin), jnp.zeros((), int),
     )  # fmt: skip
     end = jax.lax.while_loop(lambda s: jnp.any(s.running) & (s.steps < MOST_STEPS), advance, start)
 
     def climb(k, rising):
         part = end.rate * k / (WAYPOINTS + 1)
-        return rising & (output_and_slope(model, {**signals, "rate": part})[1] / gain > 0)
+        return rising & (output_and_slope(model, {**signals, "rate": part})[1] / gain > -LEVEL)
 
     return jnp.where(jax.lax.fori_loop(1, WAYPOINTS + 1, climb, end.found), end.rate, jnp.nan)

@@ -18,6 +18,7 @@ from gyromodel.campaign import Campaign
 from gyromodel.compensation import compensate
 from gyromodel.effects import Effect
 from gyromodel.effects.drivers import Bias, BiasDrift
+from gyromodel.effects.readout import LockIn
 from gyromodel.effects.scale import (
     ScaleAsymmetry,
     ScaleFactor,
@@ -225,7 +226,21 @@ def test_noise_counts_by_the_local_slope():
     model = GyroModel((ScaleFactor(value=value(7.0)), ScaleSagnacSine(kappa=value(kappa))), {"noise_white": noise})
     truth = np.linspace(-1.5, 1.5, ROWS)
     result = compensate(bench(7 * np.sin(kappa * truth) / kappa), Calibration(model))
-    assert stds(result) == pytest.approx(noise / np.sqrt(2.0) / np.cos(kappa * truth), rel=1e-9)
+    # The curve bends a little within two standard deviations.
+    assert stds(result) == pytest.approx(noise / np.sqrt(2.0) / np.cos(kappa * truth), rel=1e-3)
+
+
+def test_a_dead_band_hides_the_rate_and_says_so():
+    width, noise = 0.5, 1e-3
+    lock = LockIn(half_width=value(width), centre=value(0.0))
+    model = GyroModel((ScaleFactor(value=value(7.0)), lock), {"noise_white": noise})
+    truth = np.linspace(-1.5, 1.5, ROWS)
+    beyond = np.abs(truth) > width
+    beat = np.sign(truth) * np.sqrt(np.maximum(truth**2 - width**2, 0.0))
+    result = compensate(bench(7 * beat), Calibration(model))
+    assert rates(result)[beyond] == pytest.approx(truth[beyond], rel=1e-9)
+    assert np.abs(rates(result)[~beyond]).max() <= width * (1 + 1e-9)
+    assert stds(result)[~beyond] == pytest.approx(width / 2, rel=1e-3)
     assert "leaves out the uncertainty of its parameters" in note(result)
     assert result.metadata["rate_estimated_std_holds"] == "white noise of one sample"
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from gyromodel import __version__
 from gyromodel._checks import usual_unit
-from gyromodel.compensation import MOST_STEPS, TOLERANCE, WAYPOINTS, output_and_slope
+from gyromodel.compensation import LEVEL, MOST_STEPS, TOLERANCE, WAYPOINTS, output_and_slope
 from gyromodel.effects.drivers import BiasColumn
 from gyromodel.estimate import Calibration
 from gyromodel.export._tables import FORMULA, column_unit, entries, shown_names, validity
@@ -71,6 +71,7 @@ def as_c(calibration: Calibration) -> str:
         steps=MOST_STEPS,
         waypoints=WAYPOINTS,
         tolerance=literal(TOLERANCE),
+        level=literal(LEVEL),
     )
 
 

@@ -22,7 +22,7 @@ $statements
     return $output;
 }
 
-/* The rate itself where the output rises all the way from rest; else NaN: it lies on another branch. */
+/* The rate itself where the output nowhere falls on the way from rest; else NaN: it lies on another branch. */
 static inline double gyromodel_on_branch(const gyromodel_sample *x, double gain, double rate)
 {
     int k;
@@ -30,7 +30,7 @@ static inline double gyromodel_on_branch(const gyromodel_sample *x, double gain,
     for (k = 1; k <= $waypoints; k++) {
         double slope;
         (void)gyromodel_output(x, rate * k / ($waypoints + 1), &slope);
-        if (!(slope / gain > 0.0))
+        if (!(slope / gain > -$level))
             return NAN;
     }
     return rate;
@@ -50,8 +50,9 @@ static inline double gyromodel_rate(const gyromodel_sample *x)
     for (step = 0; step < $steps; step++) {
         double slope;
         const double excess = gyromodel_output(x, rate, &slope) / gain - target;
-        const int rising = slope / gain > 0.0;
-        const double newton = rate - excess / (slope / gain);
+        const int rising = slope / gain > -$level, steep = slope / gain > $level;
+        const double far = copysign(fmax(fabs(excess), fabs(rate)), excess); /* twice as far out each time */
+        const double newton = rate - (steep ? excess / (slope / gain) : excess == 0.0 ? 0.0 : far);
         const double size = $tolerance * (fabs(rate) + fabs(target));
         if (rising && excess < 0.0) {
             low = rate;
@@ -66,7 +67,7 @@ static inline double gyromodel_rate(const gyromodel_sample *x)
             low = rate;
             below = 0;
         }
-        if (rising && fabs(newton - rate) <= size)
+        if (rising && fabs(newton - rate) <= size && (steep || fabs(excess) <= size))
             return gyromodel_on_branch(x, gain, newton);
         if (rising && newton > low && newton < high)
             rate = newton;
