@@ -131,7 +131,7 @@ def _solve(
     slope = jnp.where(slope / gain > LEVEL, slope, gain)
     # Implicit function theorem: ∂rate/∂parameter = −(∂output/∂parameter)/(∂output/∂rate).
     jacobian = model.linearise(signals)[1] / slope[:, None]
-    # Where the output jumps or hardly follows the rate, no slope says how far noise reaches: two standard deviations do.
+    # Where the output jumps or hardly follows the rate, no slope says how far noise reaches.
     noise = jnp.sqrt(white) * gain
     reach = (invert(model, signals, output + 2 * noise, rate) - invert(model, signals, output - 2 * noise, rate)) / 4
     reach = jnp.where(jnp.isfinite(reach), reach, noise / slope)
