@@ -6,7 +6,7 @@ of unit variance. In a linear problem that is the joint fit of all stages, one s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -41,8 +41,8 @@ class FunctionFit:
     """The minimum of a sum of squares.
 
     Attributes:
-        parameters: the fitted tree, with the sources of its error: the scatter of these data under the fit's name, and
-            every source of what was given.
+        parameters: the fitted tree, with the sources of its error: the scatter of each group of these data, and every
+            source of what was given.
         scatter: standard deviation of an observation of unit `std`, one a group; 1 where `std` is known.
         residual: measured minus predicted.
         degrees_of_freedom: observations less parameters.
@@ -72,7 +72,7 @@ def fit_function(
     given: Uncertain | None = None,
     std: Float[Array | np.ndarray, "*observation"] | float | None = None,
     groups: Int[np.ndarray, " observation"] | None = None,
-    name: str = "measurement",
+    name: str | Sequence[str] = "measurement",
 ) -> FunctionFit:
     """Fit the parameters of a function by least squares.
 
@@ -86,7 +86,7 @@ def fit_function(
         std: standard deviation of each observation: known, unless `groups` makes it relative.
         groups: numbers from 0; observations of one group share an unknown factor of their `std`. Without `std` and
             groups all observations have one unknown standard deviation.
-        name: what this measurement is called in budgets.
+        name: what this measurement is called in budgets; a sequence names its groups.
 
     Raises:
         EstimateError: the data do not determine the parameters, or no solver converged.
@@ -95,6 +95,8 @@ def fit_function(
     sizes = np.broadcast_to(1.0 if std is None else np.asarray(std, float), y.shape)
     known = std is not None and groups is None
     groups = np.zeros(len(y), int) if groups is None else np.asarray(groups)
+    names = [name] * (int(groups.max(initial=0)) + 1) if isinstance(name, str) else list(name)
+    name = " and ".join(dict.fromkeys(names))
     problem = _Problem(function, start, y, data, given, groups)
     if not (np.isfinite(y).all() and np.isfinite(sizes).all() and (sizes > 0).all()):
         raise EstimateError(f"{name}: observations must be finite, and their standard deviations finite and positive")
@@ -102,7 +104,9 @@ def fit_function(
         raise EstimateError(
             f"{name}: {len(y)} observations are too few for {problem.width} parameters and their scatter"
         )
-    scatter = np.ones(groups.max() + 1)
+    if groups.shape != y.shape or set(groups) != set(range(len(names))):
+        raise EstimateError(f"{name}: groups are numbered from 0, one number an observation and one name a group")
+    scatter = np.ones(len(names))
     iterations, solution = 0, None
     for _ in range(SCALE_ROUNDS):
         weight = 1.0 / (sizes * scatter[groups])
@@ -119,8 +123,8 @@ def fit_function(
         if np.all(np.abs(scatter - before) <= SCALE_CLOSE * before + 1e-15 * np.abs(y).max()):
             break
     assert solution is not None
-    own = Source(name, np.inf if known else float(len(y) - problem.width))
-    return _finished(problem, solution._replace(iterations=iterations), 1.0 / (sizes * scatter[groups]), scatter, own)
+    weight = 1.0 / (sizes * scatter[groups])
+    return _finished(problem, solution._replace(iterations=iterations), weight, scatter, names, known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,17 +275,19 @@ def _names(tree: Any) -> list[str]:
 def _scale(problem: _Problem, x: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Residual over expected scatter of each group: squares summed over redundancy (Förstner 1979)."""
     residual, jacobian = problem.linearise(x, weight)
+    squares = np.bincount(problem.groups, residual[: len(problem.measured)] ** 2)
+    return np.sqrt(squares / np.maximum(_redundancy(problem, jacobian), 1e-3))
+
+
+def _redundancy(problem: _Problem, jacobian: np.ndarray) -> np.ndarray:
+    """Observations of each group less what the fit takes of them: its degrees of freedom."""
     norm = np.linalg.norm(jacobian, axis=0)
     basis = np.linalg.qr(jacobian / np.where(norm > 0, norm, 1.0))[0]
-    rows = len(problem.measured)
-    count = problem.groups.max() + 1
-    squares = np.bincount(problem.groups, residual[:rows] ** 2, count)
-    redundancy = np.bincount(problem.groups, 1 - np.sum(basis[:rows] ** 2, axis=1), count)
-    return np.sqrt(squares / np.maximum(redundancy, 1e-3))
+    return np.bincount(problem.groups, 1 - np.sum(basis[: len(problem.measured)] ** 2, axis=1))
 
 
 def _finished(
-    problem: _Problem, solution: Solution, weight: np.ndarray, scatter: np.ndarray, own: Source
+    problem: _Problem, solution: Solution, weight: np.ndarray, scatter: np.ndarray, names: list[str], known: bool
 ) -> FunctionFit:
     x, p, rows = solution.x, problem.width, len(problem.measured)
     residual, jacobian = problem.linearise(x, weight)
@@ -290,7 +296,10 @@ def _finished(
     inverse = np.linalg.inv(r) / norm[:, None]
     # Change of the parameters by a unit error of each observation, and of each error of what was given.
     response = (inverse @ q.T)[:p]
-    sources = {own: np.asarray(np.linalg.qr(response[:, :rows].T, mode="r")).T}
+    sources = {}
+    for group, freedom in enumerate(_redundancy(problem, jacobian)):
+        own = Source(names[group], np.inf if known else max(float(freedom), 1e-3))
+        sources[own] = np.asarray(np.linalg.qr(response[:, :rows][:, problem.groups == group].T, mode="r")).T
     first = rows
     for source, a in (problem.given.sources if problem.given is not None else {}).items():
         # The observation of an error is zero, the error itself away from its true value.
