@@ -89,9 +89,7 @@ def earth_rate(latitude: Any) -> tuple[Any, Any]:
         ValueError: the latitude is a pole's, where no position sees a horizontal component, or beyond.
     """
     if not isinstance(latitude, Tracer) and not np.all(np.abs(latitude) < np.pi / 2):
-        raise ValueError(
-            f"the latitude is {latitude} rad: six positions need one between −π/2 and π/2 (was it degrees?)"
-        )
+        raise ValueError(f"a latitude of {latitude} rad is none that six positions work at: give radians within ±π/2")
     return EARTH_RATE * jnp.cos(latitude), EARTH_RATE * jnp.sin(latitude)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import equinox as eqx
@@ -30,8 +31,8 @@ RUNAWAY = 1e8
 # Gauss-Newton steps by QR after the normal equations, which have lost half of the digits.
 POLISH = 20
 MAXIMUM_ITERATIONS = 500
-# Rounds of the residual scales of groups, and the relative change that ends them.
-SCALE_ROUNDS, SCALE_CLOSE = 50, 1e-6
+# Rounds of fit and scatter of groups, of the scatter in one linearised fit, and the relative change that ends both.
+SCALE_ROUNDS, LINEAR_ROUNDS, SCALE_CLOSE = 20, 500, 1e-6
 # A minimum whose sum of squares is this improbable, the errors being known, is a false one until other starts agree.
 IMPROBABLE = 1e-6
 
@@ -106,23 +107,19 @@ def fit_function(
         )
     if groups.shape != y.shape or set(groups) != set(range(len(names))):
         raise EstimateError(f"{name}: groups are numbered from 0, one number an observation and one name a group")
-    scatter = np.ones(len(names))
-    iterations, solution = 0, None
+    # One scatter, and nothing given that it competes with, leaves the solution as it is.
+    alone = given is None and len(names) == 1
+    scatter, iterations, start = np.ones(len(names)), 0, problem.begin
     for _ in range(SCALE_ROUNDS):
-        weight = 1.0 / (sizes * scatter[groups])
-        solution = _solve(problem, weight, known, name, None if solution is None else solution.x)
-        iterations += solution.iterations
+        solution = _solve(problem, 1.0 / (sizes * scatter[groups]), known, name, start)
+        iterations, start = iterations + solution.iterations, solution.x
         if known:
             break
-        # One scatter, and nothing given that it competes with, leaves the solution as it is.
-        alone = given is None and len(scatter) == 1
-        before, scatter = scatter, scatter * _scale(problem, solution.x, weight)
-        if alone:
+        before, scatter = scatter, _scatter(problem, solution.x, sizes, scatter)
+        if alone or _close(scatter, before, y):
             break
-        # Scatter as small as rounding has no size to converge to.
-        if np.all(np.abs(scatter - before) <= SCALE_CLOSE * before + 1e-15 * np.abs(y).max()):
-            break
-    assert solution is not None
+    else:
+        raise EstimateError(f"{name}: the scatter of its groups does not settle: state their standard deviations")
     weight = 1.0 / (sizes * scatter[groups])
     return _finished(problem, solution._replace(iterations=iterations), weight, scatter, names, known)
 
@@ -138,18 +135,22 @@ class _Problem:
     given: Uncertain | None
     groups: np.ndarray
 
-    @property
-    def width(self) -> int:
-        return len(ravel_pytree(self.start)[0])
+    @cached_property
+    def begin(self) -> np.ndarray:
+        return np.concatenate([np.asarray(ravel_pytree(self.start)[0], float), np.zeros(self.errors.shape[1])])
 
-    @property
+    @cached_property
+    def width(self) -> int:
+        return len(self.begin) - self.errors.shape[1]
+
+    @cached_property
     def errors(self) -> np.ndarray:
         """Change of the given entries by a unit of each of their independent errors."""
         if self.given is None:
             return np.zeros((0, 0))
         return np.concatenate([np.zeros((len(self.given.vector), 0)), *self.given.sources.values()], axis=1)
 
-    @property
+    @cached_property
     def arguments(self) -> tuple[Any, ...]:
         """What `_predict` takes besides the point."""
         given = () if self.given is None else (self.given.build, self.given.vector, self.errors)
@@ -164,9 +165,6 @@ class _Problem:
         more = np.concatenate([np.zeros((errors, self.width)), np.eye(errors)], axis=1)
         return np.concatenate([residual, -x[self.width :]]), np.concatenate([jacobian, more])
 
-    def begin(self) -> np.ndarray:
-        return np.concatenate([np.asarray(ravel_pytree(self.start)[0], float), np.zeros(self.errors.shape[1])])
-
 
 def _predict(x, function, build, width, data, build_given=None, given=None, errors=None):
     if build_given is None:
@@ -179,10 +177,10 @@ def _linearise(x, *arguments):
     return _predict(x, *arguments), jax.jacfwd(_predict)(x, *arguments)
 
 
-def _solve(problem: _Problem, weight: np.ndarray, known: bool, name: str, start: np.ndarray | None) -> Solution:
+def _solve(problem: _Problem, weight: np.ndarray, known: bool, name: str, start: np.ndarray) -> Solution:
     """The least of the minima that several solvers find; the first will do where nothing speaks against it."""
     best, tried, reason = None, 0, "no solver converged: give start values nearer to the solution"
-    for solution in _attempts(problem, weight, problem.begin() if start is None else start):
+    for solution in _attempts(problem, weight, start):
         tried += solution.iterations
         if not (solution.converged and np.isfinite(solution.x).all()):
             continue
@@ -231,18 +229,18 @@ def _unscaled(start, measured, weight, *arguments):
 def _polished(problem: _Problem, solution: Solution, weight: np.ndarray) -> Solution:
     """Gauss-Newton steps by QR from a minimum, as long as they get smaller."""
     x, cost, last = solution.x, solution.cost, np.inf
+    residual, jacobian = problem.linearise(x, weight)
     for _ in range(POLISH):
-        residual, jacobian = problem.linearise(x, weight)
         norm = np.linalg.norm(jacobian, axis=0)
         if not (np.isfinite(jacobian).all() and (norm > 0).all()):
             break
         step = np.linalg.lstsq(jacobian / norm, residual, rcond=None)[0]
         size, moved = float(np.linalg.norm(step)), x + step / norm
-        new = problem.linearise(moved, weight)[0]
+        residual, jacobian = problem.linearise(moved, weight)
         # At the minimum rounding decides about the cost: there the step alone says whether it is nearer.
-        if not size < last or not new @ new <= cost * (1 + 1e-6):
+        if not size < last or not residual @ residual <= cost * (1 + 1e-6):
             break
-        x, cost, last = moved, float(new @ new), size
+        x, cost, last = moved, float(residual @ residual), size
     return solution._replace(x=x, cost=cost)
 
 
@@ -253,7 +251,7 @@ def _undetermined(problem: _Problem, x: np.ndarray, weight: np.ndarray) -> str:
     scatter = np.linalg.norm(residual) / np.sqrt(len(residual))
     names = _names(problem.start) + ["what was given"] * (len(x) - problem.width)
     # A parameter that ran away to where nothing depends on it.
-    begin = np.abs(problem.begin())
+    begin = np.abs(problem.begin)
     size = np.where(begin > 0, np.maximum(np.abs(x), begin), np.inf)
     lost = ~np.isfinite(norm) | (norm * RUNAWAY * size < scatter)
     if (norm == 0).any() or lost.any():
@@ -272,18 +270,32 @@ def _names(tree: Any) -> list[str]:
     return found
 
 
-def _scale(problem: _Problem, x: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Residual over expected scatter of each group: squares summed over redundancy (Förstner 1979)."""
-    residual, jacobian = problem.linearise(x, weight)
-    squares = np.bincount(problem.groups, residual[: len(problem.measured)] ** 2)
-    return np.sqrt(squares / np.maximum(_redundancy(problem, jacobian), 1e-3))
+def _scatter(problem: _Problem, x: np.ndarray, sizes: np.ndarray, scatter: np.ndarray) -> np.ndarray:
+    """Scatter of each group in the linearised fit: squares of its residual over its redundancy (Förstner 1979)."""
+    residual, jacobian = problem.linearise(x, np.ones(len(sizes)))
+    for _ in range(LINEAR_ROUNDS):
+        weight = np.ones(len(residual))
+        weight[: len(sizes)] = 1.0 / (sizes * scatter[problem.groups])
+        basis, expected = _redundancy(problem, jacobian * weight[:, None])
+        left = residual * weight
+        left -= basis @ (basis.T @ left)
+        squares = np.bincount(problem.groups, left[: len(sizes)] ** 2)
+        before, scatter = scatter, scatter * np.sqrt(squares / np.maximum(expected, 1e-3))
+        if _close(scatter, before, problem.measured):
+            break
+    return scatter
 
 
-def _redundancy(problem: _Problem, jacobian: np.ndarray) -> np.ndarray:
-    """Observations of each group less what the fit takes of them: its degrees of freedom."""
+def _close(scatter: np.ndarray, before: np.ndarray, measured: np.ndarray) -> bool:
+    # Scatter as small as rounding has no size to converge to.
+    return bool(np.all(np.abs(scatter - before) <= SCALE_CLOSE * before + 1e-15 * np.abs(measured).max()))
+
+
+def _redundancy(problem: _Problem, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Orthonormal basis of the weighted columns; each group's observations less what the fit takes of them."""
     norm = np.linalg.norm(jacobian, axis=0)
     basis = np.linalg.qr(jacobian / np.where(norm > 0, norm, 1.0))[0]
-    return np.bincount(problem.groups, 1 - np.sum(basis[: len(problem.measured)] ** 2, axis=1))
+    return basis, np.bincount(problem.groups, 1 - np.sum(basis[: len(problem.measured)] ** 2, axis=1))
 
 
 def _finished(
@@ -297,7 +309,7 @@ def _finished(
     # Change of the parameters by a unit error of each observation, and of each error of what was given.
     response = (inverse @ q.T)[:p]
     sources = {}
-    for group, freedom in enumerate(_redundancy(problem, jacobian)):
+    for group, freedom in enumerate(_redundancy(problem, jacobian)[1]):
         own = Source(names[group], np.inf if known else max(float(freedom), 1e-3))
         sources[own] = np.asarray(np.linalg.qr(response[:, :rows][:, problem.groups == group].T, mode="r")).T
     first = rows

@@ -24,8 +24,8 @@ SPIN_AXIS = np.array([[0, -1, 0], [0, -1, 0], [1, 0, 0], [0, 0, 1], [1, 0, 0], [
 class Unit:
     """One gyro with its thermistor and its instruments; drifts in deg/h and deg/h per g, each (at 0 °C, slope per °C).
 
-    The thermistor's law: "steinhart_hart", a cubic in ln R that a calibration can meet exactly, or "beta", an exponential
-    law whose β grows with temperature, which no cubic meets.
+    The thermistor's law: "steinhart_hart", a cubic in ln R that a calibration can meet exactly, or "beta", an
+    exponential law whose β grows with temperature, which no cubic meets.
     """
 
     scale_factor: tuple[float, float]
@@ -38,7 +38,7 @@ class Unit:
     reading_noise: float = 2e-5  # of a resistance in a soak, relative
     latitude: float = np.radians(45.75)
     law: str = "steinhart_hart"
-    calibration: np.ndarray = field(default_factory=lambda: np.arange(-40.0, 61.0, 5.0))  # °C
+    calibration: np.ndarray = field(default_factory=lambda: np.repeat(np.arange(-40.0, 61.0, 5.0), 2))  # °C
 
     def resistance(self, celsius: np.ndarray) -> np.ndarray:
         """Resistance in ohm, a 10 kΩ thermistor."""
@@ -53,17 +53,17 @@ class Unit:
         return np.exp((low + high) / 2)
 
 
-# A thermometer better than the torquer's scatter in the source's table, 0.0037 of 9.29 deg/h/mA and 0.1 deg/h.
+# Currents with the scatter of the source's table: 0.0037 of 9.29 deg/h/mA, 0.1 deg/h.
 SOURCE = Unit((9.29, -0.0019), (0.9, 0.02), (1.5, 0.01), (-2.0, 0.015), rate_noise=5.6e-4, position_noise=0.015)
-# The same thermometer beside currents read to six digits, and a torquer magnet without compensation (−0.11 %/°C).
+# The same thermometer beside currents read to 5 ppm, and a torquer magnet without compensation (−0.11 %/°C).
 PRECISE = replace(
     SOURCE,
     scale_factor=(9.29, -0.0102),
     fixed=(0.9, 0.05),
     input_axis=(1.5, 0.03),
     spin_axis=(-2.0, 0.04),
-    rate_noise=1e-5,
-    position_noise=1e-4,
+    rate_noise=5e-6,
+    position_noise=5e-5,
 )
 
 
