@@ -85,7 +85,7 @@ class TemperatureModel:
         lines = [f"{'':16}{'segment':14}{'A0':>12}{'±':>10}{'A1':>12}{'±':>10}{'S':>11}{'S/|A0|':>10}"]
         for r in self.table():
             numbers = f"{r.at_zero:12.5g}{r.at_zero_std:10.2g}{r.slope:12.4g}{r.slope_std:10.2g}"
-            lines.append(f"{r.quantity:16}{r.segment:14}{numbers}{r.scatter:11.4g}{r.relative:10.4f}")
+            lines.append(f"{r.quantity:16}{r.segment:14}{numbers}{r.scatter:11.4g}{r.relative:10.5f}")
         _, changes, breaks = (np.asarray(v) for v in self.fit.value)
         for i, j in np.ndindex(*breaks.shape):
             low, high = self.breakpoint_interval[i, j]
@@ -140,7 +140,7 @@ def fit_temperature_model(
     return TemperatureModel(form, tuple(quantities), split, fit, interval)
 
 
-def _quantities(value: Any, data: tuple[Array, Array], temperature: Array | None = None) -> Array:
+def _quantities(value: Any, data: tuple[Any, Any], temperature: Array | None = None) -> Array:
     split, plugged = data
     return _curves(value, split, plugged if temperature is None else temperature)
 

@@ -10,7 +10,7 @@ from scipy.optimize import curve_fit, minimize
 
 from gyromodel.estimate import EstimateError, fit_function
 from gyromodel.estimate import _function as module
-from gyromodel.numerics.uncertain import Uncertain
+from gyromodel.numerics.uncertain import Uncertain, together
 
 X = np.linspace(0.0, 4.0, 25)
 
@@ -115,16 +115,9 @@ def test_errors_that_were_given_keep_their_sign(rng: np.random.Generator):
     assert fit.parameters.sources[next(iter(offset.sources))][0, 0] == pytest.approx(
         -next(iter(offset.sources.values()))[0, 0]
     )
-    total = module_sum(fit.parameters, offset)
+    total = together(fit.parameters, offset).propagate(lambda v: v[0] + v[1])
     assert total.std == pytest.approx([0.01 / 5])
     assert total.vector == pytest.approx([y.mean()])
-
-
-def module_sum(a: Uncertain, b: Uncertain) -> Uncertain:
-    """a + b with what they share."""
-    from gyromodel.numerics.uncertain import together
-
-    return together(a, b).propagate(lambda v: v[0] + v[1])
 
 
 def test_scatter_is_told_from_what_was_given(rng: np.random.Generator):
@@ -178,12 +171,12 @@ def test_a_parameter_that_the_data_do_not_determine_is_named():
         (np.append(X[:-1], np.nan), {"std": 0.1}, "rig: observations must be finite"),
         (X, {"std": 0.0}, "standard deviations finite and positive"),
         (X, {"groups": np.repeat([0, 2], [5, 20])}, "groups are numbered from 0"),
-        (X, {"groups": np.zeros(3, int)}, "groups are numbered from 0"),
+        (X, {"groups": np.zeros(25, int), "name": ("a", "b")}, "a and b: groups are numbered from 0"),
     ],
 )
 def test_what_cannot_be_fitted_is_refused(y: np.ndarray, options: dict, message: str):
     with pytest.raises(EstimateError, match=message):
-        fit_function(decay, START, y, jnp.asarray(X[: len(y)]), name="rig", **options)
+        fit_function(decay, START, y, jnp.asarray(X[: len(y)]), **{"name": "rig", **options})
 
 
 def test_three_observations_of_known_error_determine_three_parameters():

@@ -185,7 +185,7 @@ def _solve(problem: _Problem, weight: np.ndarray, known: bool, name: str, start:
         if not (solution.converged and np.isfinite(solution.x).all()):
             continue
         solution = _polished(problem, solution, weight)
-        weak = _undetermined(problem, solution.x, weight)
+        weak = _undetermined(problem, solution.x, weight, known)
         if weak:
             reason = f"the data do not determine {weak}: fix some parameters, or measure where they differ"
             continue
@@ -244,11 +244,12 @@ def _polished(problem: _Problem, solution: Solution, weight: np.ndarray) -> Solu
     return solution._replace(x=x, cost=cost)
 
 
-def _undetermined(problem: _Problem, x: np.ndarray, weight: np.ndarray) -> str:
+def _undetermined(problem: _Problem, x: np.ndarray, weight: np.ndarray, known: bool) -> str:
     """The parameters along which the sum of squares does not change; empty where there are none."""
     residual, jacobian = problem.linearise(x, weight)
     norm = np.linalg.norm(jacobian, axis=0)
-    scatter = np.linalg.norm(residual) / np.sqrt(len(residual))
+    # Data that happen to fit exactly determine no more than their stated errors allow.
+    scatter = max(np.linalg.norm(residual) / np.sqrt(len(residual)), float(known))
     names = _names(problem.start) + ["what was given"] * (len(x) - problem.width)
     # A parameter that ran away to where nothing depends on it.
     begin = np.abs(problem.begin)
