@@ -64,7 +64,8 @@ class TemperatureModel:
 
     def predict(self, temperature: Float[Array, " sample"]) -> Uncertain:
         """All quantities at some temperatures, (quantity × sample)."""
-        return self.fit.parameters.propagate(lambda value: _curves(value, self.split, temperature))
+        segment = jnp.where((temperature >= self.split) & (self.form == "split"), 1, 0)
+        return self.fit.parameters.propagate(lambda value: _curves(value, segment, temperature))
 
     def table(self) -> tuple[Row, ...]:
         """A0 at 0 °C, slope A1, residual standard deviation S and S/|A0|, as the source prints them, a row a segment.
@@ -120,9 +121,10 @@ def fit_temperature_model(
     values = np.stack([np.asarray(v, float) for v in quantities.values()])
     known = isinstance(temperature, Uncertain)
     t = np.asarray(temperature.value if known else temperature, float)
+    segments, count = 2 if form == "split" else 1, hinges if form == "hinge" else 0
+    # A soak keeps its side, wherever in its uncertainty the fit puts its temperature.
     segment = (t >= split).astype(int) if form == "split" else np.zeros(len(t), int)
-    segments, count = segment.max() + 1, hinges if form == "hinge" else 0
-    if np.bincount(segment).min() < 3 + 2 * count:
+    if np.bincount(segment, minlength=segments).min() < 3 + 2 * count:
         raise EstimateError(f"{name}: {form} needs {3 + 2 * count} soaks or more in each segment")
     lines = [[np.polyfit(t[segment == s], y[segment == s], 1)[::-1] for s in range(segments)] for y in values]
     changes, breaks = np.zeros((len(values), count)), np.zeros((len(values), count))
@@ -133,7 +135,7 @@ def fit_temperature_model(
         lines[i], changes[i] = [solution[:2]], solution[2:]
     start = tuple(jnp.asarray(v) for v in (lines, changes, breaks))
     groups = (np.arange(len(values))[:, None] * segments + segment).ravel()
-    data = (jnp.asarray(split), None if known else jnp.asarray(t))
+    data = (jnp.asarray(segment), None if known else jnp.asarray(t))
     given = temperature if known else None
     fit = fit_function(_quantities, start, values.ravel(), data, given=given, groups=groups, name=name)
     interval = _breakpoint_interval(fit, t, values, given)
@@ -141,15 +143,14 @@ def fit_temperature_model(
 
 
 def _quantities(value: Any, data: tuple[Any, Any], temperature: Array | None = None) -> Array:
-    split, plugged = data
-    return _curves(value, split, plugged if temperature is None else temperature)
+    segment, plugged = data
+    return _curves(value, segment, plugged if temperature is None else temperature)
 
 
-def _curves(value: tuple[Array, Array, Array], split: Any, t: Array) -> Array:
+def _curves(value: tuple[Array, Array, Array], segment: Any, t: Array) -> Array:
     """All quantities at temperatures, (quantity × sample)."""
     lines, changes, breaks = value
-    side = jnp.where(t >= split, lines.shape[1] - 1, 0)
-    chosen = lines[:, side]
+    chosen = lines[:, segment]
     return chosen[..., 0] + chosen[..., 1] * t + jnp.einsum("qh,qhs->qs", changes, _corner(t - breaks[..., None]))
 
 
@@ -180,7 +181,9 @@ def _breakpoint_interval(fit: FunctionFit, t: np.ndarray, values: np.ndarray, gi
     interval = np.zeros((len(values), count, 2))
     thermometry = np.zeros((len(t), len(t))) if given is None else given.covariance
     # The temperature of a soak changes the values at this soak alone.
-    slopes = np.asarray(jax.jvp(lambda x: _curves(fit.value, 0.0, x), (jnp.asarray(t),), (jnp.ones(len(t)),))[1])
+    slopes = np.asarray(
+        jax.jvp(lambda x: _curves(fit.value, np.zeros(len(t), int), x), (jnp.asarray(t),), (jnp.ones(len(t)),))[1]
+    )
     freedom = len(t) - 2 - 2 * count
     for i, y in enumerate(values if count else ()):
         covariance = fit.scatter[i] ** 2 * np.eye(len(t)) + slopes[i][:, None] * thermometry * slopes[i]

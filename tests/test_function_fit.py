@@ -179,6 +179,17 @@ def test_what_cannot_be_fitted_is_refused(y: np.ndarray, options: dict, message:
         fit_function(decay, START, y, jnp.asarray(X[: len(y)]), **{"name": "rig", **options})
 
 
+def test_data_without_scatter_are_fitted():
+    """Zeros, and integers on a line: residuals of exactly zero, with one group and with two."""
+    design = np.column_stack([np.ones(8), np.arange(8.0)])
+    for y in (np.zeros(8), design @ [3.0, 2.0]):
+        for groups in (None, np.repeat([0, 1], 4)):
+            fit = fit_function(line, jnp.ones(2), y, jnp.asarray(design), groups=groups)
+            assert np.asarray(fit.value) == pytest.approx([y[0], y[1] - y[0]], abs=1e-12)
+            assert np.isfinite(fit.parameters.covariance).all()
+            assert (fit.parameters.std < 1e-12).all()
+
+
 def test_three_observations_of_known_error_determine_three_parameters():
     y = 3 * np.exp(-1.3 * X[:3]) + 0.5
     fit = fit_function(decay, START, y, jnp.asarray(X[:3]), std=1e-6)

@@ -134,7 +134,7 @@ LOUD = 0.33 * EARTH_RATE * float(np.cos(LATITUDE)) / float(MODEL.scale_factor)
 
 
 def test_exact_intervals_cover_at_any_noise(rng: np.random.Generator):
-    draws = 400
+    draws = 300
     inside, _ = coverage(LOUD, draws, rng)
     low, high = binom.ppf([1e-5, 1 - 1e-5], draws, 0.95)
     assert ((inside >= low) & (inside <= high)).all(), inside / draws
@@ -142,7 +142,7 @@ def test_exact_intervals_cover_at_any_noise(rng: np.random.Generator):
 
 def test_first_order_intervals_do_not():
     """One fixed set of draws: too short for the scale factor, too long for the fixed drift."""
-    inside, first = coverage(LOUD, 400, np.random.default_rng(0))
+    inside, first = coverage(LOUD, 200, np.random.default_rng(0))
     assert first[0] < inside[0]
     assert first[1] > inside[1]
 

@@ -65,12 +65,22 @@ def test_a_hinge_is_continuous_and_finds_the_bend():
 
 
 def test_intervals_of_breakpoints_cover(rng: np.random.Generator):
-    count, inside = 30, 0
+    count, inside = 20, 0
     for _ in range(count):
         low, high = fit_temperature_model({"SF": bent(rng)["SF"]}, SOAKS, "hinge").breakpoint_interval[0, 0]
         inside += low <= BREAK <= high
     # The likelihood ratio is chi-squared only for many soaks: 90 % is asked for.
     assert inside >= binom.ppf(1e-5, count, 0.90)
+
+
+def test_a_soak_at_the_split_keeps_its_side(rng: np.random.Generator):
+    """Its temperature is uncertain by more than its distance from the split, and the two lines part there by far."""
+    t = SOAKS + np.where(SOAKS == 0, 1e-4, 0.0)
+    y = np.where(t < 0, 1.0 + 0.01 * t, 2.0 - 0.05 * t) + 1e-3 * rng.standard_normal(11)
+    temperature = Uncertain.stated(jnp.asarray(t), 0.01**2, "thermometer")
+    rows = fit_temperature_model({"Df": y}, temperature, "split").table()
+    assert [row.at_zero for row in rows] == pytest.approx([1.0, 2.0], abs=0.01)
+    assert [row.slope for row in rows] == pytest.approx([0.01, -0.05], abs=5e-4)
 
 
 def test_two_hinges_are_found():
@@ -103,6 +113,8 @@ def test_too_few_soaks_are_refused():
     few = np.array([-10.0, -5.0, 5.0, 10.0, 20.0])
     with pytest.raises(EstimateError, match="soaks: split needs 3 soaks or more in each segment"):
         fit_temperature_model({"SF": few}, few, "split")
+    with pytest.raises(EstimateError, match="split needs 3 soaks or more in each segment"):
+        fit_temperature_model({"SF": few}, few, "split", split=80.0)
     with pytest.raises(EstimateError, match="soaks: hinge needs 7 soaks"):
         fit_temperature_model({"SF": few}, few, "hinge", hinges=2)
 

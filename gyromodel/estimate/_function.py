@@ -274,6 +274,8 @@ def _names(tree: Any) -> list[str]:
 def _scatter(problem: _Problem, x: np.ndarray, sizes: np.ndarray, scatter: np.ndarray) -> np.ndarray:
     """Scatter of each group in the linearised fit: squares of its residual over its redundancy (Förstner 1979)."""
     residual, jacobian = problem.linearise(x, np.ones(len(sizes)))
+    # Data without any scatter are held to their last digit, and not divided by zero.
+    least = np.finfo(float).eps * max(float(np.abs(problem.measured / sizes).max()), 1e-100)
     for _ in range(LINEAR_ROUNDS):
         weight = np.ones(len(residual))
         weight[: len(sizes)] = 1.0 / (sizes * scatter[problem.groups])
@@ -281,7 +283,7 @@ def _scatter(problem: _Problem, x: np.ndarray, sizes: np.ndarray, scatter: np.nd
         left = residual * weight
         left -= basis @ (basis.T @ left)
         squares = np.bincount(problem.groups, left[: len(sizes)] ** 2)
-        before, scatter = scatter, scatter * np.sqrt(squares / np.maximum(expected, 1e-3))
+        before, scatter = scatter, np.maximum(scatter * np.sqrt(squares / np.maximum(expected, 1e-3)), least)
         if _close(scatter, before, problem.measured):
             break
     return scatter
