@@ -6,8 +6,9 @@ of unit variance. In a linear problem that is the joint fit of all stages, one s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import equinox as eqx
@@ -32,8 +33,8 @@ POLISH = 20
 MAXIMUM_ITERATIONS = 500
 # Without scaling more are needed, and cheap: they are compiled in one loop.
 UNSCALED_ITERATIONS = 10_000
-# Rounds of the residual scales of groups, and the relative change that ends them.
-SCALE_ROUNDS, SCALE_CLOSE = 50, 1e-6
+# Rounds of fit and scatter of groups, of the scatter in one linearised fit, and the relative change that ends both.
+SCALE_ROUNDS, LINEAR_ROUNDS, SCALE_CLOSE = 20, 500, 1e-6
 # A minimum whose sum of squares is this improbable, the errors being known, is a false one until other starts agree.
 IMPROBABLE = 1e-6
 
@@ -43,8 +44,8 @@ class FunctionFit:
     """The minimum of a sum of squares.
 
     Attributes:
-        parameters: the fitted tree, with the sources of its error: the scatter of these data under the fit's name, and
-            every source of what was given.
+        parameters: the fitted tree, with the sources of its error: the scatter of each group of these data, and every
+            source of what was given.
         scatter: standard deviation of an observation of unit `std`, one a group; 1 where `std` is known.
         residual: measured minus predicted.
         degrees_of_freedom: observations less parameters.
@@ -74,7 +75,7 @@ def fit_function(
     given: Uncertain | None = None,
     std: Float[Array | np.ndarray, "*observation"] | float | None = None,
     groups: Int[np.ndarray, " observation"] | None = None,
-    name: str = "measurement",
+    name: str | Sequence[str] = "measurement",
 ) -> FunctionFit:
     """Fit the parameters of a function by least squares.
 
@@ -88,7 +89,7 @@ def fit_function(
         std: standard deviation of each observation: known, unless `groups` makes it relative.
         groups: numbers from 0; observations of one group share an unknown factor of their `std`. Without `std` and
             groups all observations have one unknown standard deviation.
-        name: what this measurement is called in budgets.
+        name: what this measurement is called in budgets; a sequence names its groups.
 
     Raises:
         EstimateError: the data do not determine the parameters, or no solver converged.
@@ -97,6 +98,8 @@ def fit_function(
     sizes = np.broadcast_to(1.0 if std is None else np.asarray(std, float), y.shape)
     known = std is not None and groups is None
     groups = np.zeros(len(y), int) if groups is None else np.asarray(groups)
+    names = [name] * (int(groups.max(initial=0)) + 1) if isinstance(name, str) else list(name)
+    name = " and ".join(dict.fromkeys(names))
     problem = _Problem(function, start, y, data, given, groups)
     if not (np.isfinite(y).all() and np.isfinite(sizes).all() and (sizes > 0).all()):
         raise EstimateError(f"{name}: observations must be finite, and their standard deviations finite and positive")
@@ -104,25 +107,23 @@ def fit_function(
         raise EstimateError(
             f"{name}: {len(y)} observations are too few for {problem.width} parameters and their scatter"
         )
-    scatter = np.ones(groups.max() + 1)
-    iterations, solution = 0, None
+    if groups.shape != y.shape or set(groups) != set(range(len(names))):
+        raise EstimateError(f"{name}: groups are numbered from 0, one number an observation and one name a group")
+    # One scatter, and nothing given that it competes with, leaves the solution as it is.
+    alone = given is None and len(names) == 1
+    scatter, iterations, start = np.ones(len(names)), 0, problem.begin
     for _ in range(SCALE_ROUNDS):
-        weight = 1.0 / (sizes * scatter[groups])
-        solution = _solve(problem, weight, known, name, None if solution is None else solution.x)
-        iterations += solution.iterations
+        solution = _solve(problem, 1.0 / (sizes * scatter[groups]), known, name, start)
+        iterations, start = iterations + solution.iterations, solution.x
         if known:
             break
-        # One scatter, and nothing given that it competes with, leaves the solution as it is.
-        alone = given is None and len(scatter) == 1
-        before, scatter = scatter, scatter * _scale(problem, solution.x, weight)
-        if alone:
+        before, scatter = scatter, _scatter(problem, solution.x, sizes, scatter)
+        if alone or _close(scatter, before, y):
             break
-        # Scatter as small as rounding has no size to converge to.
-        if np.all(np.abs(scatter - before) <= SCALE_CLOSE * before + 1e-15 * np.abs(y).max()):
-            break
-    assert solution is not None
-    own = Source(name, np.inf if known else float(len(y) - problem.width))
-    return _finished(problem, solution._replace(iterations=iterations), 1.0 / (sizes * scatter[groups]), scatter, own)
+    else:
+        raise EstimateError(f"{name}: the scatter of its groups does not settle: state their standard deviations")
+    weight = 1.0 / (sizes * scatter[groups])
+    return _finished(problem, solution._replace(iterations=iterations), weight, scatter, names, known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,18 +137,22 @@ class _Problem:
     given: Uncertain | None
     groups: np.ndarray
 
-    @property
-    def width(self) -> int:
-        return len(ravel_pytree(self.start)[0])
+    @cached_property
+    def begin(self) -> np.ndarray:
+        return np.concatenate([np.asarray(ravel_pytree(self.start)[0], float), np.zeros(self.errors.shape[1])])
 
-    @property
+    @cached_property
+    def width(self) -> int:
+        return len(self.begin) - self.errors.shape[1]
+
+    @cached_property
     def errors(self) -> np.ndarray:
         """Change of the given entries by a unit of each of their independent errors."""
         if self.given is None:
             return np.zeros((0, 0))
         return np.concatenate([np.zeros((len(self.given.vector), 0)), *self.given.sources.values()], axis=1)
 
-    @property
+    @cached_property
     def arguments(self) -> tuple[Any, ...]:
         """What `_predict` takes besides the point."""
         given = () if self.given is None else (self.given.build, self.given.vector, self.errors)
@@ -162,9 +167,6 @@ class _Problem:
         more = np.concatenate([np.zeros((errors, self.width)), np.eye(errors)], axis=1)
         return np.concatenate([residual, -x[self.width :]]), np.concatenate([jacobian, more])
 
-    def begin(self) -> np.ndarray:
-        return np.concatenate([np.asarray(ravel_pytree(self.start)[0], float), np.zeros(self.errors.shape[1])])
-
 
 def _predict(x, function, build, width, data, build_given=None, given=None, errors=None):
     if build_given is None:
@@ -177,15 +179,15 @@ def _linearise(x, *arguments):
     return _predict(x, *arguments), jax.jacfwd(_predict)(x, *arguments)
 
 
-def _solve(problem: _Problem, weight: np.ndarray, known: bool, name: str, start: np.ndarray | None) -> Solution:
+def _solve(problem: _Problem, weight: np.ndarray, known: bool, name: str, start: np.ndarray) -> Solution:
     """The least of the minima that several solvers find; the first will do where nothing speaks against it."""
     best, tried, reason = None, 0, "no solver converged: give start values nearer to the solution"
-    for solution in _attempts(problem, weight, problem.begin() if start is None else start):
+    for solution in _attempts(problem, weight, start):
         tried += solution.iterations
         if not (solution.converged and np.isfinite(solution.x).all()):
             continue
         solution = _polished(problem, solution, weight)
-        weak = _undetermined(problem, solution.x, weight)
+        weak = _undetermined(problem, solution.x, weight, known)
         if weak:
             reason = f"the data do not determine {weak}: fix some parameters, or measure where they differ"
             continue
@@ -229,29 +231,30 @@ def _unscaled(start, measured, weight, *arguments):
 def _polished(problem: _Problem, solution: Solution, weight: np.ndarray) -> Solution:
     """Gauss-Newton steps by QR from a minimum, as long as they get smaller."""
     x, cost, last = solution.x, solution.cost, np.inf
+    residual, jacobian = problem.linearise(x, weight)
     for _ in range(POLISH):
-        residual, jacobian = problem.linearise(x, weight)
         norm = np.linalg.norm(jacobian, axis=0)
         if not (np.isfinite(jacobian).all() and (norm > 0).all()):
             break
         step = np.linalg.lstsq(jacobian / norm, residual, rcond=None)[0]
         size, moved = float(np.linalg.norm(step)), x + step / norm
-        new = problem.linearise(moved, weight)[0]
+        residual, jacobian = problem.linearise(moved, weight)
         # At the minimum rounding decides about the cost: there the step alone says whether it is nearer.
-        if not size < last or not new @ new <= cost * (1 + 1e-6):
+        if not size < last or not residual @ residual <= cost * (1 + 1e-6):
             break
-        x, cost, last = moved, float(new @ new), size
+        x, cost, last = moved, float(residual @ residual), size
     return solution._replace(x=x, cost=cost)
 
 
-def _undetermined(problem: _Problem, x: np.ndarray, weight: np.ndarray) -> str:
+def _undetermined(problem: _Problem, x: np.ndarray, weight: np.ndarray, known: bool) -> str:
     """The parameters along which the sum of squares does not change; empty where there are none."""
     residual, jacobian = problem.linearise(x, weight)
     norm = np.linalg.norm(jacobian, axis=0)
-    scatter = np.linalg.norm(residual) / np.sqrt(len(residual))
+    # Data that happen to fit exactly determine no more than their stated errors allow.
+    scatter = max(np.linalg.norm(residual) / np.sqrt(len(residual)), float(known))
     names = _names(problem.start) + ["what was given"] * (len(x) - problem.width)
     # A parameter that ran away to where nothing depends on it.
-    begin = np.abs(problem.begin())
+    begin = np.abs(problem.begin)
     size = np.where(begin > 0, np.maximum(np.abs(x), begin), np.inf)
     lost = ~np.isfinite(norm) | (norm * RUNAWAY * size < scatter)
     if (norm == 0).any() or lost.any():
@@ -270,20 +273,38 @@ def _names(tree: Any) -> list[str]:
     return found
 
 
-def _scale(problem: _Problem, x: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Residual over expected scatter of each group: squares summed over redundancy (Förstner 1979)."""
-    residual, jacobian = problem.linearise(x, weight)
+def _scatter(problem: _Problem, x: np.ndarray, sizes: np.ndarray, scatter: np.ndarray) -> np.ndarray:
+    """Scatter of each group in the linearised fit: squares of its residual over its redundancy (Förstner 1979)."""
+    residual, jacobian = problem.linearise(x, np.ones(len(sizes)))
+    # Data without any scatter are held to their last digit, and not divided by zero.
+    least = np.finfo(float).eps * max(float(np.abs(problem.measured / sizes).max()), 1e-100)
+    for _ in range(LINEAR_ROUNDS):
+        weight = np.ones(len(residual))
+        weight[: len(sizes)] = 1.0 / (sizes * scatter[problem.groups])
+        basis, expected = _redundancy(problem, jacobian * weight[:, None])
+        left = residual * weight
+        left -= basis @ (basis.T @ left)
+        squares = np.bincount(problem.groups, left[: len(sizes)] ** 2)
+        before, scatter = scatter, np.maximum(scatter * np.sqrt(squares / np.maximum(expected, 1e-3)), least)
+        if _close(scatter, before, problem.measured):
+            break
+    return scatter
+
+
+def _close(scatter: np.ndarray, before: np.ndarray, measured: np.ndarray) -> bool:
+    # Scatter as small as rounding has no size to converge to.
+    return bool(np.all(np.abs(scatter - before) <= SCALE_CLOSE * before + 1e-15 * np.abs(measured).max()))
+
+
+def _redundancy(problem: _Problem, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Orthonormal basis of the weighted columns; each group's observations less what the fit takes of them."""
     norm = np.linalg.norm(jacobian, axis=0)
     basis = np.linalg.qr(jacobian / np.where(norm > 0, norm, 1.0))[0]
-    rows = len(problem.measured)
-    count = problem.groups.max() + 1
-    squares = np.bincount(problem.groups, residual[:rows] ** 2, count)
-    redundancy = np.bincount(problem.groups, 1 - np.sum(basis[:rows] ** 2, axis=1), count)
-    return np.sqrt(squares / np.maximum(redundancy, 1e-3))
+    return basis, np.bincount(problem.groups, 1 - np.sum(basis[: len(problem.measured)] ** 2, axis=1))
 
 
 def _finished(
-    problem: _Problem, solution: Solution, weight: np.ndarray, scatter: np.ndarray, own: Source
+    problem: _Problem, solution: Solution, weight: np.ndarray, scatter: np.ndarray, names: list[str], known: bool
 ) -> FunctionFit:
     x, p, rows = solution.x, problem.width, len(problem.measured)
     residual, jacobian = problem.linearise(x, weight)
@@ -292,7 +313,10 @@ def _finished(
     inverse = np.linalg.inv(r) / norm[:, None]
     # Change of the parameters by a unit error of each observation, and of each error of what was given.
     response = (inverse @ q.T)[:p]
-    sources = {own: np.asarray(np.linalg.qr(response[:, :rows].T, mode="r")).T}
+    sources = {}
+    for group, freedom in enumerate(_redundancy(problem, jacobian)[1]):
+        own = Source(names[group], np.inf if known else max(float(freedom), 1e-3))
+        sources[own] = np.asarray(np.linalg.qr(response[:, :rows][:, problem.groups == group].T, mode="r")).T
     first = rows
     for source, a in (problem.given.sources if problem.given is not None else {}).items():
         # The observation of an error is zero, the error itself away from its true value.

@@ -46,13 +46,18 @@ class Uncertain:
 
         Args:
             value: a tree of arrays.
-            covariance: of its entries, flattened in the order of the tree; a vector holds variances.
+            covariance: of its entries, flattened in the order of the tree; a vector or a number holds variances.
             name: what the source is called in budgets.
             degrees_of_freedom: behind the covariance; infinite if it is known exactly.
+
+        Raises:
+            ValueError: the covariance has another size than the value, or negative eigenvalues.
         """
         vector, build = ravel_pytree(value)
-        covariance = np.asarray(covariance, float)
-        matrix = np.diag(np.atleast_1d(covariance)) if covariance.ndim < 2 else covariance
+        size, covariance = len(vector), np.asarray(covariance, float)
+        if covariance.shape not in {(), (size,), (size, size)}:
+            raise ValueError(f"{name}: a covariance of shape {covariance.shape} does not fit a value of {size} entries")
+        matrix = covariance if covariance.ndim == 2 else np.diag(np.broadcast_to(covariance, size))
         return cls(np.asarray(vector), build, {Source(name, degrees_of_freedom): factor_of(matrix)})
 
     @property
@@ -105,18 +110,19 @@ class Uncertain:
 
 def together(*parts: Uncertain) -> Uncertain:
     """Several uncertain values as one, a tuple of them, with what their errors have in common."""
-    ends = np.cumsum([len(p.vector) for p in parts])
-    starts = ends - [len(p.vector) for p in parts]
-
-    def build(vector: Array) -> tuple[Any, ...]:
-        return tuple(p.build(vector[a:b]) for p, a, b in zip(parts, starts, ends, strict=True))
-
     sources: dict[Source, np.ndarray] = {}
     for source in dict.fromkeys(s for p in parts for s in p.sources):
         width = next(p.sources[source].shape[1] for p in parts if source in p.sources)
         rows = [p.sources.get(source, np.zeros((len(p.vector), width))) for p in parts]
         sources[source] = np.concatenate(rows)
+    # Equal for equal shapes, so that what is compiled for one value serves the next.
+    build = jax.tree_util.Partial(_split, tuple(p.build for p in parts), tuple(len(p.vector) for p in parts))
     return Uncertain(np.concatenate([p.vector for p in parts]), build, sources)
+
+
+def _split(builds: tuple[Callable[[Any], Any], ...], sizes: tuple[int, ...], vector: Array) -> tuple[Any, ...]:
+    ends = np.cumsum(sizes)
+    return tuple(build(vector[end - size : end]) for build, size, end in zip(builds, sizes, ends, strict=True))
 
 
 def factor_of(covariance: Float[np.ndarray, "entry entry"]) -> Float[np.ndarray, "entry error"]:
