@@ -19,8 +19,8 @@ Array = np.ndarray
 
 # +-2.5 plot units (bit) = +-0.0076 deg/s: bit per deg/h of a sum over one second.
 SCALE_FACTOR = 2.5 / (0.0076 * 3600)
-# Slopes (bit/degC) and breakpoints (degC) that are printed; joined to one continuous curve.
-SLOPES, BREAKPOINTS = (0.3386, 0.1045, 0.4082), (23.6, 30.0)
+# Slopes (bit/degC) of the three printed lines, and the temperatures (degC) at which these cross: one continuous curve.
+SLOPES, BREAKPOINTS = (0.3386, 0.1045, 0.4082), (22.724, 31.244)
 LOW, HIGH = 14.0, 42.0
 COIL = 300.0  # s, diffusion time of the coil
 
