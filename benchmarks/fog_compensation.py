@@ -133,7 +133,9 @@ def main(argv: list[str] | None = None) -> None:
         "",
         *said,
     ]
-    write_result("fog_compensation", "Compensation of a fiber-optic gyro over temperature", "fog_compensation", argv, lines)
+    write_result(
+        "fog_compensation", "Compensation of a fiber-optic gyro over temperature", "fog_compensation", argv, lines
+    )
 
 
 if __name__ == "__main__":

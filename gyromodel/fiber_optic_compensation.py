@@ -1,7 +1,7 @@
 """The published temperature compensation of a fiber-optic gyro at rest: means over 5 s, a low pass, three lines.
 
-Source: 2021 thesis on a fiber-optic-gyro line-of-sight stabilisation system, chapter 3, equations (3-8)-(3-10). Its lines
-are independent and jump where they meet; the package's own compensation is `bias_temperature_curve` with hinges.
+Source: 2021 thesis on a fiber-optic-gyro line-of-sight stabilisation system, chapter 3, equations (3-8)-(3-10). Its
+lines are independent and jump where they meet; the package's own compensation is `bias_temperature_curve` with hinges.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ PRINTED_SCALE_FACTOR = 2.5 / (0.0076 * 3600.0)
 class ThreeLines(eqx.Module):
     """R_c = K T + R0 below the first, between and above the second breakpoint, each line by itself (3-8)-(3-10)."""
 
-    slopes: Float[Array, "3"] = eqx.field(converter=jnp.asarray)
-    intercepts: Float[Array, "3"] = eqx.field(converter=jnp.asarray)
-    breakpoints: Float[Array, "2"] = eqx.field(converter=jnp.asarray, default=BREAKPOINTS)
+    slopes: Float[Array, " line"] = eqx.field(converter=jnp.asarray)
+    intercepts: Float[Array, " line"] = eqx.field(converter=jnp.asarray)
+    breakpoints: Float[Array, " breakpoint"] = eqx.field(converter=jnp.asarray, default=BREAKPOINTS)
 
     def __call__(self, temperature: Float[Array, " sample"]) -> Float[Array, " sample"]:
         """The bias at some temperatures (°C), in the unit of the fitted output."""
         return _lines_at(self, temperature)
 
     @property
-    def jumps(self) -> Float[Array, "2"]:
+    def jumps(self) -> Float[Array, " breakpoint"]:
         """By how much the bias jumps upwards at each breakpoint."""
         return jnp.diff(self.slopes) * self.breakpoints + jnp.diff(self.intercepts)
 
     @property
-    def crossings(self) -> Float[Array, "2"]:
+    def crossings(self) -> Float[Array, " breakpoint"]:
         """Temperatures at which neighbouring lines meet (°C)."""
         return -jnp.diff(self.intercepts) / jnp.diff(self.slopes)
 
@@ -102,7 +102,7 @@ def published_chain(
 
 @jax.jit
 def fit_three_lines(
-    temperature: Float[Array, " mean"], output: Float[Array, " mean"], breakpoints: Float[Array, "2"]
+    temperature: Float[Array, " mean"], output: Float[Array, " mean"], breakpoints: Float[Array, " breakpoint"]
 ) -> ThreeLines:
     """Three independent least-squares lines, one a range of temperature (3-8)-(3-10).
 
@@ -127,6 +127,6 @@ def _lines_at(lines: ThreeLines, temperature: Float[Array, " sample"]) -> Float[
     return lines.slopes[part] * temperature + lines.intercepts[part]
 
 
-def _part(temperature: Float[Array, " sample"], breakpoints: Float[Array, "2"]) -> Int[Array, " sample"]:
+def _part(temperature: Float[Array, " sample"], breakpoints: Float[Array, " breakpoint"]) -> Int[Array, " sample"]:
     """Which line holds: T ≤ 23.6 is the low one, T ≥ 30 the high one, as printed."""
     return (temperature > breakpoints[0]).astype(int) + (temperature >= breakpoints[1])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,6 @@ from scipy.stats import f as fisher
 
 from gyromodel.campaign import Campaign
 from gyromodel.effects.drivers import Bias
-from gyromodel.effects.scale import ScaleFactor
 from gyromodel.estimate import Estimate, EstimateError, filter_of, fit_record, with_noise_intervals
 from gyromodel.model import GyroModel
 from gyromodel.noise import deviation
@@ -79,7 +78,7 @@ def angle_random_walk(output: Float[np.ndarray, " sample"], bandwidth: float, sc
 
 def random_walk_coefficients(
     times: Float[np.ndarray, " time"], squares: Float[np.ndarray, " time"]
-) -> Float[np.ndarray, "3"]:
+) -> Float[np.ndarray, " coefficient"]:
     """a0, a1, a2 of Bs²(τ) = a0 + a1/τ + a2/τ² by least squares; RWC = √a1 (3-7)."""
     return np.linalg.lstsq(_powers(times), squares, rcond=None)[0]
 
@@ -140,8 +139,8 @@ def figures_of_merit(
 
     Standard uncertainties: B0 of the plain mean under the run's fitted noise (white, flicker, random walk from its
     start), not s/√n; Bs and ARW by χ² with the degrees of freedom that the fitted noise leaves; RWC from the covariance
-    of Bs²(τ) at all τ together, on draws of the fitted noise; Br by χ² with Q − 1; Bt of the ratio it comes from, which as
-    the largest of several leans upwards.
+    of Bs²(τ) at all τ together, on draws of the fitted noise; Br by χ² with Q − 1; Bt of the ratio it comes from, which
+    as the largest of several leans upwards.
 
     Args:
         campaigns: runs of one unit, each at one temperature.
@@ -175,12 +174,11 @@ class _Run:
     gap: str
 
     @classmethod
-    def of(cls, campaign: Campaign, name: str, scale_factor: str | None) -> _Run:
-        record = read_signals(campaign)
-        model = _model(campaign, record, scale_factor)
+    def of(cls, campaign: Campaign, name: str, scale_factor: str | None) -> Self:
+        record, model = _as_rate(campaign, scale_factor), GyroModel((Bias(),))
         estimate = with_noise_intervals(fit_record(record, model))
         plain = fit_record(record, model, ratios=estimate.ratios, ordinary=True)
-        output = np.where(record.present, np.asarray(record.signals["output"])[: record.rows], np.nan)
+        rate = np.where(record.present, np.asarray(record.signals["output"])[: record.rows], np.nan)
         temperature, unsteady = np.nan, ""
         if "temperature" in record.signals:
             values = np.asarray(record.signals["temperature"])[: record.rows]
@@ -191,10 +189,7 @@ class _Run:
         step = np.diff(np.asarray(record.signals["time"])[: record.rows])
         missing = int((~record.present).sum() + (step > 1.5 * record.interval).sum())
         gap = f"the run has {missing} gaps or missing samples; use a stretch without" if missing else ""
-        rate = output / float(model.gain())
-        return cls(
-            name, rate, record.interval, record, estimate, float(plain.std[0]), temperature, unsteady, gap
-        )
+        return cls(name, rate, record.interval, record, estimate, float(plain.std[0]), temperature, unsteady, gap)
 
     @property
     def bias(self) -> float:
@@ -214,7 +209,7 @@ class _Run:
         allan = deviation(self.rate, self.interval)
         at = int(np.argmin(allan.deviation))
         floor = float(allan.deviation[at]) / FLICKER_FLOOR
-        # The local slope, which those degrees of freedom rest on, is uncertain at the end: at most one an averaging time.
+        # The local slope, on which those degrees of freedom rest, is poor at the end: at most one an averaging time.
         freedom = min(allan.degrees_of_freedom[at], len(self.rate) * self.interval / allan.tau[at])
         floor_std = floor / float(np.sqrt(2.0 * freedom))
         reached = at < len(allan.tau) - 2
@@ -222,9 +217,13 @@ class _Run:
         walk = angle_random_walk(rate, bandwidth or 1.0 / self.interval)
         coefficient, coefficient_std, reason = _random_walk(lengths * self.interval, squares, drawn)
         return [
-            self._figure("B0", self.bias, self.mean_std, gls, float(self.estimate.std[0]), "generalised least squares", ""),
+            self._figure(
+                "B0", self.bias, self.mean_std, gls, float(self.estimate.std[0]), "generalised least squares", ""
+            ),
             self._figure("Bs", stability, stability * relative, floor, floor_std, floor_name, ""),
-            self._figure("ARW", walk, walk * relative, white, white_std, "N by likelihood", self.gap or self._coloured()),
+            self._figure(
+                "ARW", walk, walk * relative, white, white_std, "N by likelihood", self.gap or self._coloured()
+            ),
             self._figure("RWC", coefficient, coefficient_std, white, white_std, "N by likelihood", self.gap or reason),
         ]
 
@@ -242,7 +241,7 @@ class _Run:
         rows = len(self.record.sampling.present)
         count = int(np.clip(MOST_DRAWN // rows, FEWEST_DRAWS, DRAWS))
         white = np.random.default_rng(0).standard_normal((count, rows))
-        scale = np.sqrt(self.estimate.white_variance) / abs(float(self.estimate.model.gain()))
+        scale = np.sqrt(self.estimate.white_variance)
         noise = _colour_all(filter_of(self.record, self.estimate.ratios), jnp.asarray(white))
         return stability_squares(scale * np.asarray(noise)[:, : self.record.rows][:, self.record.present], lengths)
 
@@ -260,21 +259,21 @@ class _Run:
 _colour_all = jax.jit(jax.vmap(colour, (None, 0)))
 
 
-def _model(campaign: Campaign, record: Record, scale_factor: str | None) -> GyroModel:
-    """A known scale factor and a free bias; no scale factor where the output is a rate."""
-    text = scale_factor or campaign.metadata.get("nominal_scale_factor")
+def _as_rate(campaign: Campaign, scale_factor: str | None) -> Record:
+    """The run's signals, its output divided by the nominal scale factor unless it is a rate already."""
+    record = read_signals(campaign)
     if record.output_unit == "rad/s":
-        return GyroModel((Bias(),))
-    wanted = f"{record.output_unit}/(rad/s)"
-    example = f"0.09 {record.output_unit}/(deg/h)"
+        return record
+    text = scale_factor or campaign.metadata.get("nominal_scale_factor")
+    wanted, example = f"{record.output_unit}/(rad/s)", f"0.09 {record.output_unit}/(deg/h)"
+    said = f"{campaign.name}: the output is in [{record.output_unit}]: "
     if text is None:
-        raise EstimateError(f"{campaign.name}: the output is in [{record.output_unit}]: state the scale factor ({example})")
+        raise EstimateError(f"{said}state the nominal scale factor, such as {example}")
     value, unit = quantity(str(text))
     if not convertible(unit, wanted) or value == 0:
-        raise EstimateError(f"{campaign.name}: the scale factor {text} does not turn a rate into [{record.output_unit}]: "
-                            f"state one such as {example}")  # fmt: skip
-    gain = ScaleFactor(value=jnp.asarray(value * factor(unit, wanted)))  # type: ignore[arg-type]
-    return GyroModel((gain, Bias()), fixed=frozenset({("scale_factor", "value")}))
+        raise EstimateError(f"{said}a scale factor of {text} does not give that, {example} would")
+    output = record.signals["output"] / (value * factor(unit, wanted))
+    return record._replace(signals={**record.signals, "output": output}, output_unit="rad/s")
 
 
 def _random_walk(times: np.ndarray, squares: np.ndarray, drawn: np.ndarray) -> tuple[float, float, str]:
@@ -321,7 +320,9 @@ def _points(runs: list[_Run]) -> list[_Point]:
         else:
             groups.append([run])
     return [
-        _Point(float(np.mean([r.temperature for r in g])), np.array([r.bias for r in g]), np.array([r.mean_std for r in g]))
+        _Point(
+            float(np.mean([r.temperature for r in g])), np.array([r.bias for r in g]), np.array([r.mean_std for r in g])
+        )
         for g in groups
     ]
 
@@ -344,7 +345,9 @@ def _sensitivity(points: list[_Point], room_temperature: float) -> Figure:
     name = "steeper of two lines joined at room temperature"
     temperature = np.array([p.temperature for p in points])
     if len(points) < 2 or not np.isfinite(temperature).all():
-        return _figure("Bt", "all", (np.nan,) * 4, "deg/h/degC", name, f"needs runs that differ by more than {STEADY:g} °C")
+        return _figure(
+            "Bt", "all", (np.nan,) * 4, "deg/h/degC", name, f"needs runs that differ by more than {STEADY:g} °C"
+        )
     biases = np.array([p.biases.mean() for p in points])
     variance = np.array([(p.stds**2).mean() / len(p.biases) for p in points])
     room = int(np.argmin(np.abs(temperature - room_temperature)))

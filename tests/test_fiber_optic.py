@@ -96,7 +96,11 @@ def test_every_pair_of_thermometers_is_tried_and_the_pair_is_kept(tmp_path: Path
         "temperature_a_rate": [0.0, 0.0],
     }.items()}  # fmt: skip
     pairs = [e.between for e in BiasTemperatureGradient.candidates(signals)]
-    assert pairs == [("temperature", "temperature_a"), ("temperature", "temperature_b"), ("temperature_a", "temperature_b")]
+    assert pairs == [
+        ("temperature", "temperature_a"),
+        ("temperature", "temperature_b"),
+        ("temperature_a", "temperature_b"),
+    ]
     assert BiasTemperatureGradient().prepared(signals).between == pairs[0]
     chosen = BiasTemperatureGradient(coefficient=jnp.asarray(DEG_H), between=pairs[2])
     for effect in (chosen, BiasTemperatureGradient()):

@@ -36,7 +36,10 @@ def test_the_printed_lines_jump_where_they_meet():
         float(middle[0] * at[0] + middle[1] - low[0] * at[0] - low[1]) / 100,
         float(high[0] * at[1] + high[1] - middle[0] * at[1] - middle[1]) / 100,
     ]
-    crossings = [float((low[1] - middle[1]) / (middle[0] - low[0])), float((middle[1] - high[1]) / (high[0] - middle[0]))]
+    crossings = [
+        float((low[1] - middle[1]) / (middle[0] - low[0])),
+        float((middle[1] - high[1]) / (high[0] - middle[0])),
+    ]
     lines = printed_lines()
     assert np.asarray(lines.jumps) == pytest.approx(jumps, rel=1e-12)
     assert np.asarray(lines.crossings) == pytest.approx(crossings, rel=1e-12)

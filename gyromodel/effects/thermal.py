@@ -125,7 +125,9 @@ class BiasTemperatureGradient(_BetweenThermometers):
     site = "rate"
     needs = ("temperature", "temperature_<place>")
     cause = "A temperature difference across the coil or between coil and electronics strains them or shifts an offset."
-    test = "Watch a soak recover: the difference fades more slowly than the temperature rate that drives the Shupe effect."
+    test = (
+        "Watch a soak recover: the difference fades more slowly than the temperature rate that drives the Shupe effect."
+    )
 
     coefficient: Float[Array, ""] = parameter("deg/h/degC", 1.0, "bias per degree of difference")
 

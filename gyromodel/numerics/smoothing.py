@@ -1,4 +1,4 @@
-"""Derivative of a noisy, unevenly sampled record by a cubic smoothing spline, its smoothness by robust cross-validation.
+"""Derivative of a noisy, unevenly sampled record by a cubic smoothing spline, smooth by robust cross-validation.
 
 Criterion: M. A. Lukas, Robust generalized cross-validation for choosing the regularization parameter, Inverse Problems
 22 (2006).
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import BSpline, make_smoothing_spline
 from scipy.linalg import solveh_banded
-from scipy.optimize import brentq
+from scipy.optimize import bisect
 
 # More knots than this cost time and resolve nothing of a thermal record.
 MAXIMUM_KNOTS = 400
@@ -47,8 +47,8 @@ def smooth_derivative(
 def smoothing_bandwidth(time: Float[np.ndarray, " sample"], values: Float[np.ndarray, " sample"]) -> float:
     """Frequency (1/unit of time) at which `smooth_derivative` of this record passes 1/√2 of the true derivative.
 
-    A spline of penalty λ and unit spacing passes 1/(1 + λ(2πf)⁴) of what varies with frequency f; means over a knot pass
-    sinc f of it. At most half the frequency of the knots.
+    A spline of penalty λ and unit spacing passes 1/(1 + λ(2πf)⁴) of what varies with frequency f; means over a knot
+    pass sinc f of it. At most half the frequency of the knots.
 
     Raises:
         ValueError: fewer than six samples, or constant values: nothing is smoothed.
@@ -61,8 +61,8 @@ def smoothing_bandwidth(time: Float[np.ndarray, " sample"], values: Float[np.nda
     def above(f: float) -> float:
         return float(np.sinc(f * averaged)) / (1.0 + smooth.penalty * (2.0 * np.pi * f) ** 4) - np.sqrt(0.5)
 
-    edge = 0.5 if above(0.5) >= 0 else brentq(above, 0.0, 0.5)
-    return float(edge) / smooth.unit
+    edge = 0.5 if above(0.5) >= 0 else bisect(above, 0.0, 0.5)
+    return edge / smooth.unit  # type: ignore[operator]
 
 
 def _smoothed(time: np.ndarray, values: np.ndarray) -> _Smooth:
@@ -80,7 +80,7 @@ def _smoothed(time: np.ndarray, values: np.ndarray) -> _Smooth:
 
 
 def _best_penalty(x: np.ndarray, y: np.ndarray) -> float:
-    """The penalty λ of least robust cross-validation, Σ(y − f)² + λ∫f″²; all levels, since it can have several minima.
+    """The penalty λ of Σ(y − f)² + λ∫f″² by robust cross-validation; all levels, since it can have several minima.
 
     The traces in it are those of evenly spaced knots, which pass cosines of frequency ω by 1/(1 + λ d(ω)).
     """

@@ -1,4 +1,4 @@
-"""A fiber-optic gyro by the published output model F = S_n (I + E + D)(1 + 1e-6 eps_k), its heat diffusing into the coil.
+"""A fiber-optic gyro by the published output model F = S_n (I + E + D)(1 + 1e-6 eps_k), heat diffusing into its coil.
 
 Written from a 2021 thesis on a line-of-sight stabilisation system, chapter 3: numbers in bits are those that it prints.
 The environment term E is a bias over temperature that bends at two temperatures, the Shupe effect of the coil's own
@@ -43,7 +43,7 @@ class Gyro:
 
 
 def chamber(hours: float, rng: np.random.Generator, step: float = 1.0) -> tuple[Array, Array]:
-    """Time and case temperature: from 14 to 42 degC and back, with soaks, at ramp speeds that differ from run to run."""
+    """Time and case temperature: from 14 to 42 degC and back, with soaks; ramp speeds differ from run to run."""
     time = np.arange(0.0, 3600 * hours, step)
     parts = np.array([0.08, 0.32, 0.15, 0.22, 0.08, 0.15]) * rng.uniform(0.8, 1.2, 6)
     corners = np.concatenate([[0.0], np.cumsum(parts) / parts.sum()]) * time[-1]
