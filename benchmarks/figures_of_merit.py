@@ -71,9 +71,9 @@ def main(argv: list[str] | None = None) -> None:
     head = ["noise", "figure", "published: mean, scatter/stated", "modern: mean, scatter/stated", "refused"]
     lines = [
         f"{seeds} runs of {ROWS} samples {STEP:g} s apart for each noise: white {WHITE} deg/√h, random walk {WALK} "
-        f"deg/h/√h from the start of the run, flicker {FLICKER} deg/h that began long before it; no bias. Scatter/stated is the "
-        "standard deviation of the figure over runs, over the root mean square of its stated standard uncertainty: one "
-        "is right. The last column is the same for B0 with s/√n.",
+        f"deg/h/√h from the start of the run, flicker {FLICKER} deg/h that began long before it; no bias. "
+        "Scatter/stated is the standard deviation of the figure over runs, over the root mean square of its stated "
+        "standard uncertainty: one is right. The last column is the same for B0 with s/√n.",
         "",
         *table([*head, "B0 with s/√n"], study(seeds)),
     ]

@@ -85,7 +85,7 @@ def _best_penalty(x: np.ndarray, y: np.ndarray) -> float:
     The traces in it are those of evenly spaced knots, which pass cosines of frequency ω by 1/(1 + λ d(ω)).
     """
     n, h = len(x), np.diff(x)
-    # Rows of second divided differences, R f″ = Qᵀf, and the bands of R and QᵀQ (Green and Silverman 1994, section 2.1).
+    # Qᵀ takes differences of slopes, R f″ = Qᵀf; the bands of R and QᵀQ (Green and Silverman 1994, section 2.1).
     a, b, c = 1 / h[:-1], -1 / h[:-1] - 1 / h[1:], 1 / h[1:]
     mass, bending = np.zeros((3, n - 2)), np.zeros((3, n - 2))
     mass[2], mass[1, 1:] = (h[:-1] + h[1:]) / 3, h[1:-1] / 6
