@@ -75,7 +75,8 @@ def main(argv: list[str] | None = None) -> None:
     lines = [
         "Root-mean-square error of dT/dt over the rms of the true one, mean of "
         f"{DRAWS} draws. The best width of the filter is chosen with the truth in hand. Shortest period: of what passes "
-        f"with 1/√2 of its amplitude. Median time of the spline: {1000 * np.median(seconds):.0f} ms.",
+        "with 1/√2 of its amplitude. Median processor time of the spline: "
+        f"{1000 * np.median(seconds):.0f} ms.",
         "",
         *table([*head, "spline, plain cross-validation", "spline, as used", "shortest period"], rows),
     ]
