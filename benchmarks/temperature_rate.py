@@ -74,8 +74,8 @@ def main(argv: list[str] | None = None) -> None:
     head = ["record", "course", "step, °C", "noise, °C", "differences", "Savitzky-Golay, best of 5 widths"]
     lines = [
         "Root-mean-square error of dT/dt over the rms of the true one, mean of "
-        f"{DRAWS} draws. The best width of the filter is chosen with the truth in hand. Shortest period: of what passes "
-        "with 1/√2 of its amplitude. Median processor time of the spline: "
+        f"{DRAWS} draws. The best width of the filter is chosen with the truth in hand. Shortest period: of what "
+        "passes with 1/√2 of its amplitude. Median processor time of the spline: "
         f"{1000 * np.median(seconds):.0f} ms.",
         "",
         *table([*head, "spline, plain cross-validation", "spline, as used", "shortest period"], rows),
