@@ -85,8 +85,8 @@ def _table(head: list[str], rows: list[list[str]]) -> str:
 
 
 def _plain(text: str) -> str:
-    """Text whose angle brackets are no HTML."""
-    return text.replace("<", "&lt;")
+    """Text whose angle brackets are no HTML; between backticks they never are."""
+    return "`".join(part if i % 2 else part.replace("<", "&lt;") for i, part in enumerate(text.split("`")))
 
 
 if __name__ == "__main__":

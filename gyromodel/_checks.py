@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
 from functools import lru_cache
 from typing import Any
 
@@ -11,8 +12,9 @@ import numpy as np
 
 from gyromodel import units as unit_system
 
-# Signals that models see besides the columns.
-DERIVED = ("time_on", "temperature_rate")
+# Signals that models see besides the columns: time since power-on, and the rate of each thermometer.
+DERIVED = re.compile(r"time_on|temperature(_.+)?_rate")
+_THERMOMETER = re.compile(r"temperature(_.+)?(?<!_rate)")
 KINDS = ("rate", "increment", "angle")
 MAX_METADATA = 10_000
 
@@ -58,7 +60,7 @@ def check_unit(name: str, unit: str | None) -> str:
     if not _COLUMN_NAME.fullmatch(name) or len(name.encode()) > 200:
         rule = 'it must start with a letter or digit, have at most 200 bytes and none of [ ] , ; " / \\'
         raise CampaignError(f"{shown(name)} cannot name a column: {rule}")
-    if name in DERIVED:
+    if DERIVED.fullmatch(name):
         raise CampaignError(f"column '{name}' has the name of a signal that is derived from others: rename it")
     known = _known(name)
     if unit is None:
@@ -109,6 +111,11 @@ def check_time(time: np.ndarray, first_row: int = 1, previous: float | None = No
             f"column 'time' must increase from row to row, but is {time[row - 1]} at data row {first_row + row - 1} "
             f"and {time[row]} at data row {first_row + row} (row 1 is the first below the header)"
         )
+
+
+def thermometers(names: Iterable[str]) -> list[str]:
+    """Those of the names that are thermometers, `temperature` before every temperature_<place>."""
+    return sorted(name for name in names if _THERMOMETER.fullmatch(name))
 
 
 def shown(text: str) -> str:

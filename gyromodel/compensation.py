@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from gyromodel._checks import thermometers
 from gyromodel.campaign import Campaign
 from gyromodel.effects import Signals
 from gyromodel.estimate import Calibration, check_covariates
@@ -77,7 +78,8 @@ def _held(calibration: Calibration) -> list[str]:
 def _estimate(calibration: Calibration, record: Record) -> tuple[np.ndarray, np.ndarray]:
     """Rate and its variance, of real rows; the variance is NaN where neither covariance nor noise is known."""
     model, covariance = calibration.model, calibration.covariance
-    names = {"time", "time_on", "temperature_rate", "rate", *(n for e in model.effects for n in e.columns_needed)}
+    needed = {name for effect in model.effects for name in effect.columns_needed}
+    names = {"time", "time_on", "rate", *needed, *(f"{name}_rate" for name in thermometers(needed))}
     signals = {name: values for name, values in record.signals.items() if name in names}
     output = jnp.where(record.sampling.present, record.signals["output"], jnp.nan)
     white = jnp.asarray(model.noise.get("noise_white", 0.0)) ** 2 / record.interval

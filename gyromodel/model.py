@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from gyromodel.campaign import Campaign
 from gyromodel.declarations import column_of
 from gyromodel.effects import CATALOGUE, Effect, Signals
-from gyromodel.effects._base import evaluate
+from gyromodel.effects._base import evaluate, lacking
 from gyromodel.effects.drivers import BiasColumn
 from gyromodel.noise import NOISE_UNITS, NoiseRatios, markov_sum
 from gyromodel.numerics.state_space import build_filter, colour
@@ -92,11 +92,10 @@ class GyroModel(eqx.Module):
     def check_columns(self, signals: Signals) -> None:
         """Refuse signals without a column that an effect needs."""
         for effect in self.effects:
-            for name in effect.columns_needed:
-                if name not in signals:
-                    close = get_close_matches(effect.label, CATALOGUE, n=1) if isinstance(effect, BiasColumn) else []
-                    hint = f"; did you mean {close[0]}?" if close else ""
-                    raise ModelError(f"effect {effect.label} needs a column {name}, which the campaign lacks{hint}")
+            for name in lacking(effect.columns_needed, signals):
+                close = get_close_matches(effect.label, CATALOGUE, n=1) if isinstance(effect, BiasColumn) else []
+                hint = f"; did you mean {close[0]}?" if close else ""
+                raise ModelError(f"effect {effect.label} needs a column {name}, which the campaign lacks{hint}")
 
     def prepared(self, signals: Signals) -> GyroModel:
         """Reference points and start values that depend on the campaign filled in."""

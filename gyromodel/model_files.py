@@ -268,6 +268,8 @@ def _read_setting(place: _Place, effect: Effect, name: str) -> Any:
     if isinstance(default, tuple | int):
         places = place.items(name) if isinstance(default, tuple) else [place]
         texts = [p.text() for p in places]
+        if isinstance(default, tuple) and isinstance(default[0], str):
+            return tuple(texts)
         if not all(re.fullmatch(r"[-+]?\d{1,2}", text) for text in texts):
             raise place.error(f"{name} takes whole numbers below 100")
         numbers = tuple(int(text) for text in texts)
@@ -328,6 +330,8 @@ def _document(model: GyroModel, estimate: Estimate | None) -> dict[str, Any]:
                 entry[name] = {"value": entry[name], "std": _shown(np.reshape(known, values.shape), unit)}
         for name in (f.name for f in fields(effect) if f.name not in (*effect.declared(), "column", "unit")):
             value = getattr(effect, name)
+            if isinstance(value, tuple) and not any(value):
+                continue
             if isinstance(value, tuple | int):
                 entry[name] = list(value) if isinstance(value, tuple) else value
             elif np.isfinite(float(value)):

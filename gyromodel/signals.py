@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from gyromodel._checks import CampaignError
+from gyromodel._checks import CampaignError, thermometers
 from gyromodel.campaign import Campaign
 from gyromodel.numerics.smoothing import smooth_derivative
 from gyromodel.numerics.state_space import Sampling
@@ -130,8 +130,8 @@ def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
         columns = {n: campaign.si(n) for n in names}
         columns["time"] = time - time[0]
         columns["time_on"] = columns["time"] + _power_on(campaign)
-        if "temperature" in columns:
-            columns["temperature_rate"] = _thermometer_rate(time, columns["temperature"])
+        for name in thermometers(names):
+            columns[f"{name}_rate"] = _thermometer_rate(time, columns[name])
         if len(campaigns) > 1 and "campaign" not in names:
             columns["campaign"] = np.full(len(time), 1.0 + len(blocks))
         columns["output"] = output

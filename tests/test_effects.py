@@ -37,6 +37,8 @@ def signals_of(rng: np.random.Generator) -> dict[str, jax.Array]:
         "rate": rng.uniform(-1.5, 1.2, ROWS),
         "temperature": 20 + 15 * np.sin(time / 300) + rng.uniform(-1, 1, ROWS),
         "temperature_rate": 0.05 * np.cos(time / 300),
+        "temperature_coil": 20 + 14 * np.sin(time / 300 - 0.2),
+        "temperature_coil_rate": 0.045 * np.cos(time / 300 - 0.2),
         "pressure": 1e5 + 100 * rng.standard_normal(ROWS),
         "output": rng.standard_normal(ROWS),
     }
@@ -185,6 +187,23 @@ BY_HAND = [
         [10.0, -10.0],
     ),
     (
+        "bias_temperature_gradient",
+        {"coefficient": "2 deg/h/degC"},
+        {"temperature": [20.0, 25.0], "temperature_coil": [20.0, 24.0]},
+        [0.0, 2.0],
+    ),
+    (
+        "bias_temperature_gradient_rate",
+        {"coefficient": "1000 deg/h/(degC/s)"},
+        {
+            "temperature": [20.0, 20.0],
+            "temperature_coil": [20.0, 20.0],
+            "temperature_rate": [0.01, 0.01],
+            "temperature_coil_rate": [0.0, 0.03],
+        },
+        [10.0, -20.0],
+    ),
+    (
         "bias_pressure",
         {"coefficient": "2 deg/h/mbar", "reference": "1000 mbar"},
         {"pressure": [1e5, 1.003e5]},
@@ -257,6 +276,7 @@ def test_equation_by_hand(label: str, fields: dict[str, str], columns: dict[str,
     extra = {"harmonics": 1} if label == "lock_in_dithered" else extra
     effect = type(effect)(**{k: jnp.asarray(internal(v)) for k, v in fields.items()}, **extra)
     signals = {"time": jnp.zeros(len(expected))} | {k: jnp.asarray(v) for k, v in columns.items()}
+    effect = effect.prepared(signals) if "temperature_coil" in signals else effect
     unit = DEG_H if effect.site == "rate" else 1e-6
     assert np.asarray(effect.contribution(signals)) / unit == pytest.approx(expected, rel=1e-9, abs=1e-9)
 

@@ -8,17 +8,18 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 
+from gyromodel._checks import DERIVED
 from gyromodel.effects import CATALOGUE, Effect, Signals
+from gyromodel.effects._base import lacking
 from gyromodel.effects.drivers import BiasColumn
 from gyromodel.signals import Record
 
 # Length scales of the smooth functions, as parts of the driver's range.
 SMOOTH_SCALES = (0.08, 0.2, 0.5)
 PAIR_SCALES = (0.25, 0.6)
-DERIVED = ("time", "time_on", "output", "temperature_rate")
 # Columns whose linear effect on the bias is in the catalogue, is the scale factor, or means nothing.
 OWN_EFFECTS = ("rate", "temperature", "campaign")
-NOT_DRIVERS = ("segment", "run", "position")
+NOT_DRIVERS = ("time", "output", "segment", "run", "position")
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,11 @@ class Bank:
 
 def driver_names(record: Record) -> tuple[str, ...]:
     """Measured columns that vary: what an unknown discrepancy may follow, besides time."""
-    return tuple(n for n in record.signals if n not in DERIVED + NOT_DRIVERS and not _unusable(record, n))
+    return tuple(n for n in record.signals if not _is_no_driver(n) and not _unusable(record, n))
+
+
+def _is_no_driver(name: str) -> bool:
+    return name in NOT_DRIVERS or bool(DERIVED.fullmatch(name))
 
 
 def build_bank(record: Record) -> Bank:
@@ -86,7 +91,7 @@ def build_bank(record: Record) -> Bank:
             blocks.extend((name, "effect", _weighted(e, signals, rate), e) for e in forms)
     plain = [n for n in driver_names(record) if n not in OWN_EFFECTS]
     for name in record.signals:
-        reason = "" if name in DERIVED + NOT_DRIVERS else _unusable(record, name)
+        reason = "" if _is_no_driver(name) else _unusable(record, name)
         if reason:
             not_testable |= {f"smooth({name})": reason} | (
                 {} if name in OWN_EFFECTS else {BiasColumn(column=name).label: reason}
@@ -114,9 +119,9 @@ def _structure(name: str, effect: Effect | None, width: int) -> str:
 
 def _missing(kind: type[Effect], record: Record) -> str:
     for name in kind.needs:
-        if name not in record.signals:
+        if lacking((name,), record.signals):
             return f"needs a column {name}"
-        if reason := _unusable(record, name):
+        if name in record.signals and (reason := _unusable(record, name)):
             return reason
     return ""
 

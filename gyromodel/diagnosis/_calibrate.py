@@ -43,7 +43,7 @@ def null_scores(
     kept = _cache_folder() / f"{_design(scanner, baseline, columns, draws, seed)}.npy"
     if kept.exists():
         return np.load(kept)
-    skip = skipped(baseline.model)
+    skip = skipped(baseline.model, scanner.record.signals)
     cells = [0] if scanner.stated else scanner.only_cells
     if cells is None:
         cells = cells_of_weight(rank(scanner, scanner.coarse_cells(), baseline, (), skip), WITHIN)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from gyromodel._checks import thermometers
 from gyromodel.diagnosis._evidence import log_sum
 from gyromodel.diagnosis._scan import CellResult, Scanner
-from gyromodel.effects.drivers import BiasPeriodic
+from gyromodel.effects.drivers import BiasColumn, BiasPeriodic
 from gyromodel.estimate import Estimate
 from gyromodel.model import GyroModel
 
@@ -126,7 +128,7 @@ def rank(
 
 def rank_where_it_matters(scanner: Scanner, estimate: Estimate, pulses: tuple[int, ...]) -> Ranking:
     """Rank over the noise cells that matter: every other level, then neighbours of those with weight for any."""
-    skip = skipped(estimate.model)
+    skip = skipped(estimate.model, scanner.record.signals)
     if scanner.stated:
         cells = [0] if estimate.noise_given else scanner.only_cells or scanner.all_cells()
         return rank(scanner, cells, estimate, pulses, skip)
@@ -154,8 +156,17 @@ def line_frequencies(model: GyroModel) -> np.ndarray:
     return np.concatenate([np.zeros(0), *(np.ravel(e.frequency) for e in model.effects if isinstance(e, BiasPeriodic))])
 
 
-def skipped(model: GyroModel) -> set[str]:
-    """Candidates that make no sense beside a model: what it has free, and what it has in a more general form."""
+def skipped(model: GyroModel, columns: Iterable[str]) -> set[str]:
+    """Candidates that make no sense beside a model: what it has free, and what it has in a more general form.
+
+    Beside a bias proportional to one thermometer, one of a second thermometer is the same as one of their difference,
+    which keeps the name; unless the model has the second.
+    """
     held = model.wholly_fixed()
     have = {name for e in model.effects for name in (e.label, *e.supersedes)}
+    seconds = {BiasColumn(column=name).label for name in thermometers(columns)[1:]}
+    if have & seconds:
+        have.add("bias_temperature_gradient")
+    elif "bias_temperature" in have:
+        have |= seconds
     return have - held - {"bias_step", "bias_periodic"}

@@ -152,6 +152,6 @@ def not_testable(scanner: Scanner, ranking: Ranking, model: GyroModel) -> dict[s
     result = ranking.results[ranking.best_cell()]
     return {
         name: "cannot be told from what the model already has on this campaign"
-        for name in {b.name for b in scanner.bank.blocks if b.kind == "effect"} - skipped(model)
+        for name in {b.name for b in scanner.bank.blocks if b.kind == "effect"} - skipped(model, scanner.record.signals)
         if name not in result.evidence and not (result.energy.get(name, np.zeros(1)) > 0).any()
     }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Literal, Self
 
@@ -12,8 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from gyromodel._checks import thermometers
+
 Signals = Mapping[str, Float[Array, " sample"]]
 Site = Literal["gain", "scale", "rate"]
+# In `needs`: any thermometer besides `temperature`.
+SECOND_THERMOMETER = "temperature_<place>"
 
 
 @dataclass(frozen=True)
@@ -146,6 +150,12 @@ class Effect(eqx.Module):
             for direction in jnp.eye(jnp.size(value)):
                 derivatives.append(jax.jvp(moved, (jnp.ravel(value),), (direction,))[1])
         return jnp.stack(derivatives, axis=1) if derivatives else jnp.zeros((signals["time"].shape[0], 0))
+
+
+def lacking(needed: Iterable[str], signals: Signals) -> list[str]:
+    """Columns needed that the signals lack; temperature_<place> stands for any second thermometer."""
+    second = len(thermometers(signals)) > 1
+    return [name for name in needed if name not in signals and not (name == SECOND_THERMOMETER and second)]
 
 
 @eqx.filter_jit

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 from typing import Self
 
 import equinox as eqx
@@ -9,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from gyromodel._checks import thermometers
 from gyromodel.effects._base import Effect, Signals, parameter, round_reference, setting, stack
 from gyromodel.effects._shapes import check_curve, curve_columns, curve_forms
 
@@ -85,6 +88,70 @@ class BiasTemperatureRate(Effect):
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """dT/dt of the smoothed thermometer."""
         return stack(signals["temperature_rate"])
+
+
+class _BetweenThermometers(Effect):
+    """An effect of the difference of two thermometers, of places named in `between`; the first two if empty."""
+
+    between: tuple[str, str] = eqx.field(static=True, default=("", ""), kw_only=True)
+
+    def __check_init__(self) -> None:
+        if len(set(self.between)) != 2 and any(self.between):
+            raise ValueError("between takes the names of two thermometers")
+
+    @property
+    def columns_needed(self) -> tuple[str, ...]:
+        """The two thermometers."""
+        return self.between if any(self.between) else self.needs
+
+    def prepared(self, signals: Signals) -> Self:
+        """Take the first two thermometers: `temperature`, then the others by name."""
+        if any(self.between):
+            return self
+        first, second = thermometers(signals)[:2]
+        return dataclasses.replace(self, between=(first, second))
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """Every pair of thermometers whose difference is known and varies."""
+        pairs = itertools.combinations(thermometers(signals), 2)
+        return [cls(between=(a, b)) for a, b in pairs if np.ptp(np.asarray(signals[a] - signals[b])) > 0]
+
+
+class BiasTemperatureGradient(_BetweenThermometers):
+    """E += D_∇T (T1 − T2): bias proportional to the temperature difference between two places."""
+
+    id = "bias_temperature_gradient"
+    site = "rate"
+    needs = ("temperature", "temperature_<place>")
+    cause = "A temperature difference across the coil or between coil and electronics strains them or shifts an offset."
+    test = (
+        "Watch a soak recover: the difference fades more slowly than the temperature rate that drives the Shupe effect."
+    )
+
+    coefficient: Float[Array, ""] = parameter("deg/h/degC", 1.0, "bias per degree of difference")
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """T1 − T2."""
+        first, second = self.between
+        return stack(signals[first] - signals[second])
+
+
+class BiasTemperatureGradientRate(_BetweenThermometers):
+    """E += D_∇Ṫ d(T1 − T2)/dt: bias proportional to the rate of the difference between two places."""
+
+    id = "bias_temperature_gradient_rate"
+    site = "rate"
+    needs = ("temperature", "temperature_<place>")
+    cause = "A changing temperature gradient along the fiber unbalances the two counter-propagating phases."
+    test = "Compare the edges of ramps with their plateaus: this error comes at the edges only."
+
+    coefficient: Float[Array, ""] = parameter("deg/h/(degC/s)", 1000.0, "bias per unit of the difference's rate")
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """Difference of dT/dt of the two smoothed thermometers."""
+        first, second = self.between
+        return stack(signals[f"{first}_rate"] - signals[f"{second}_rate"])
 
 
 class BiasWarmup(Effect):

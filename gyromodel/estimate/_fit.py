@@ -113,8 +113,7 @@ def fit_record(
 
 def check_covariates(record: Record, model: GyroModel) -> None:
     """Refuse missing values in a column that an effect needs, and a missing column."""
-    model.check_columns(record.signals)
-    for effect in model.effects:
+    for effect in model.prepared(record.signals).effects:
         for name in effect.columns_needed:
             bad = np.flatnonzero(~np.isfinite(np.asarray(record.signals[name])[: record.rows]) & record.present)
             if len(bad):

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from gyromodel._checks import thermometers
 from gyromodel.estimate._estimate import Estimate, EstimateError
 from gyromodel.estimate._fit import filter_of
 from gyromodel.estimate._optimistix import response_to_changes
@@ -94,10 +95,10 @@ def _changes_of_columns(
             raise EstimateError(f"the second fit saw another {name} than the first stage gives: fit it again")
         slope = jax.jacfwd(lambda v, name=name: of(v)[name])(jnp.asarray(given.vector))
         found[name] = np.asarray(slope) @ errors
-    if "temperature" in found:
-        base = np.asarray(record.signals["temperature"])[: record.rows]
+    for name in thermometers(found):
+        base = np.asarray(record.signals[name])[: record.rows]
         # The smoothing adapts to the data: a difference over one standard error each way is its derivative.
-        ends = [np.stack([thermometer_rate(record, base + s * d) for d in found["temperature"].T]) for s in (1.0, -1.0)]
-        found["temperature_rate"] = (ends[0] - ends[1]).T / 2
+        ends = [np.stack([thermometer_rate(record, base + s * d) for d in found[name].T]) for s in (1.0, -1.0)]
+        found[f"{name}_rate"] = (ends[0] - ends[1]).T / 2
     extra = len(record.signals["time"]) - record.rows
     return {name: np.pad(change, ((0, extra), (0, 0)), mode="edge") for name, change in found.items()}

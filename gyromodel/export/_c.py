@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gyromodel import __version__
-from gyromodel._checks import usual_unit
+from gyromodel._checks import thermometers, usual_unit
 from gyromodel.compensation import LEVEL, MOST_STEPS, TOLERANCE, WAYPOINTS, output_and_slope
 from gyromodel.effects.drivers import BiasColumn
 from gyromodel.estimate import Calibration
@@ -25,12 +25,10 @@ from gyromodel.numerics.c_code import NoCForm, Statements, literal
 from gyromodel.units import internal_unit
 
 TEMPLATE = Path(__file__).with_name("template.h")
-SIGNAL_UNITS = {"time_on": "s", "temperature_rate": "degC/s"}
 SIGNAL_MEANINGS = {
     "output": "measured",
     "time": "since the start of the run",
     "time_on": "since power-on",
-    "temperature_rate": "of a smoothed thermometer",
 }
 # Three samples are lowered and the middle one is written: what stands for its neighbours must not be needed.
 NEIGHBOUR = "neighbour"
@@ -54,8 +52,9 @@ def as_c(calibration: Calibration) -> str:
         if NEIGHBOUR in reached:
             raise ModelError(f"effect {effect.label} cannot be exported to C: it looks at other samples than its own")
     statements, reached, output, slope = _lowered(model, members)
+    meanings = SIGNAL_MEANINGS | {f"{name}_rate": "of a smoothed thermometer" for name in thermometers(members)}
     fields = [
-        f"    double {member};" + (f" /* {SIGNAL_MEANINGS[name]} */" if name in SIGNAL_MEANINGS else "")
+        f"    double {member};" + (f" /* {meanings[name]} */" if name in meanings else "")
         for name, member in members.items()
         if name == "output" or f"x->{member}" in reached
     ]
@@ -77,12 +76,13 @@ def as_c(calibration: Calibration) -> str:
 
 def _members(model: GyroModel) -> dict[str, str]:
     """What the model may read of a sample, with the name and unit that it has in C."""
-    units = {"output": _output_unit(model), "time": "s", **SIGNAL_UNITS}
+    units = {"output": _output_unit(model), "time": "s", "time_on": "s"}
     for effect in model.effects:
         for name in effect.columns_needed:
             if isinstance(effect, BiasColumn):
                 units[name] = column_unit(effect)
             units.setdefault(name, usual_unit(name))
+    units |= {f"{name}_rate": "degC/s" for name in thermometers(units)}
     units.pop("rate", None)
     members = {name: _identifier(name, unit) for name, unit in units.items()}
     for name, member in members.items():

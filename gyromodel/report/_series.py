@@ -25,6 +25,7 @@ _BY_NAME = {
     "bias_periodic": "phase",
     "bias_temperature_rate": "temperature:rate",
     "bias_temperature_curve": "temperature",
+    "bias_temperature_gradient": "temperature:difference",
     "scale_temperature": "temperature:product",
     "scale_temperature_curve": "temperature:product",
 }

@@ -21,6 +21,8 @@ PHRASES = {
     "bias_temperature": "a bias proportional to temperature",
     "bias_temperature_curve": "a bias that curves with temperature",
     "bias_temperature_rate": "a temperature-rate bias",
+    "bias_temperature_gradient": "a bias proportional to a temperature difference",
+    "bias_temperature_gradient_rate": "a bias proportional to the rate of a temperature difference",
     "bias_warmup": "a warm-up bias",
     "bias_drift": "a bias drift in time",
     "bias_step": "a step of the bias",

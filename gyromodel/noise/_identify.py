@@ -1,0 +1,356 @@
+"""Which kinds of noise a record holds, how large each is, and what the record cannot show.
+
+The kinds are white N, quantisation Q, flicker B, random walk K and one Markov process (q, Tc), by their restricted
+likelihood with the bias, a trend and steady lines as regressors. A kind counts as found only if no mixture of the
+others explains the record as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import product
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.stats import norm
+from threadpoolctl import threadpool_limits
+
+from gyromodel.noise._deviation import deviation
+from gyromodel.noise._fits import (
+    FLICKER,
+    MARKOV,
+    MARKOV_THRESHOLD,
+    THRESHOLD,
+    TIME_CONSTANT,
+    WHITE,
+    Fits,
+    Model,
+)
+from gyromodel.noise._lines import MOST_LINES, Spectrum, background, find_lines, line_columns, spectrum
+from gyromodel.noise._reduced import MOST_ROWS, Mixture, reduced
+
+Verdict = Literal["found", "ambiguous", "not identifiable"]
+
+KINDS = ("noise_white", "noise_quantisation", "noise_flicker", "noise_random_walk", "noise_markov")
+# Square root of twice the log likelihood ratio at the ends of a 95 % interval, and of a 95 % upper bound.
+TWO_SIDED, ONE_SIDED = 1.960, 1.645
+# The same for a trend, which a random walk imitates: in 150 records each without a trend, at five sizes of the walk, it
+# exceeded 12 once.
+TREND = 12.0
+# Frequencies per bin of the whitened spectrum; their mean may miss one by this factor, and by chance this seldom.
+FEWEST_IN_BIN, BINS, MISFIT, BY_CHANCE = 24, 40, 1.25, 1e-4
+# Loss of independent frequencies by the Hann window: 1 + 2 (4/9 + 1/36).
+HANN = 35.0 / 18.0
+FIRST_IN_BIN = 4
+FEWEST = 64
+# A step longer than this many intervals leaves out samples.
+GAP = 1.5
+# Lines slower than this many cycles a sample stay regressors where rows are grouped.
+SLOW_LINE = 1e-2
+# Half the 95 % point of chi-squared with one degree of freedom.
+BETTER = 1.92
+# A kind whose absence costs this much needs no search without it.
+CERTAIN = 50.0
+# All kinds but Markov noise; the same but white noise; the same but flicker.
+BROWN, NOT_WHITE = (True, True, True, True, False), (False, True, True, True, False)
+UNFLICKERING = (True, True, False, True, False)
+
+
+class NoiseTerm(NamedTuple):
+    """One kind of noise, in units of the rate and s.
+
+    `value` with its 95 % limits where `verdict` is found; where it is ambiguous, the size if it is this kind rather than
+    one of `alternatives`; where it is not identifiable, the record shows no more than the upper limit, at 95 %.
+    """
+
+    value: float
+    low: float
+    high: float
+    verdict: Verdict
+    alternatives: tuple[str, ...] = ()
+    time_constant: float = float("nan")
+
+    def scaled(self, unit: float) -> NoiseTerm:
+        """The same in another unit."""
+        return self._replace(value=self.value * unit, low=self.low * unit, high=self.high * unit)
+
+
+class Line(NamedTuple):
+    """A steady line: frequency (Hz), amplitude in the unit of the rate, and its standard error."""
+
+    frequency: float
+    amplitude: float
+    std: float
+
+
+class IdentifiedNoise(NamedTuple):
+    """Terms by public noise id, the trend per second, steady lines, and whether the spectrum bears it all out.
+
+    `misfits` lists frequency bands (Hz) whose power is not the model's, with the ratio of measured to fitted power.
+    """
+
+    terms: dict[str, NoiseTerm]
+    lines: tuple[Line, ...]
+    more_lines: bool
+    misfits: tuple[tuple[float, float, float], ...]
+
+    @property
+    def fits(self) -> bool:
+        """Whether the record is a sum of these kinds."""
+        return not self.misfits and not self.more_lines
+
+    def allan_variance(self, tau: Float[np.ndarray, " tau"]) -> dict[str, Float[np.ndarray, " tau"]]:
+        """Allan variance of each term that is found or ambiguous, of the trend and of the lines, by averaging time."""
+        formulas = {
+            "noise_white": lambda t: t.value**2 / tau,
+            "noise_quantisation": lambda t: 3.0 * t.value**2 / tau**2,
+            "noise_flicker": lambda t: 2.0 * np.log(2.0) / np.pi * t.value**2 + 0.0 * tau,
+            "noise_random_walk": lambda t: t.value**2 * tau / 3.0,
+            "noise_rate_ramp": lambda t: t.value**2 * tau**2 / 2.0,
+            "noise_markov": lambda t: _markov_variance(t.value, t.time_constant, tau),
+        }
+        return {k: formulas[k](t) for k, t in self.terms.items() if t.verdict != "not identifiable"}
+
+
+def _markov_variance(q: float, constant: float, tau: np.ndarray) -> np.ndarray:
+    x = tau / constant
+    return (q * constant) ** 2 / tau * (1.0 - (3.0 - 4.0 * np.exp(-x) + np.exp(-2.0 * x)) / (2.0 * x))
+
+
+def identify_noise(
+    rate: Float[np.ndarray, " sample"],
+    time: Float[np.ndarray, " sample"],
+    restart: np.ndarray | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> IdentifiedNoise:
+    """Identify the noise of a record at rest.
+
+    Args:
+        rate: NaN where a sample is missing.
+        time: of each sample (s), increasing within each record; gaps are allowed.
+        restart: where independent records begin; the first row by default.
+        progress: called with a line and the fraction done.
+
+    Returns:
+        Terms with 95 % profile likelihood intervals, lines, and what the model does not explain.
+
+    Raises:
+        ValueError: there are fewer than 64 samples, or they do not vary.
+    """
+    rate, time = np.asarray(rate, float), np.asarray(time, float)
+    restart = np.arange(len(rate)) == 0 if restart is None else np.asarray(restart, bool)
+    present = np.isfinite(rate)
+    if present.sum() < FEWEST or not np.ptp(rate[present]) > 0:
+        raise ValueError(
+            f"{int(present.sum())} samples{'' if present.sum() < FEWEST else ' of one value'} show no noise: "
+            f"at least {FEWEST} that vary are needed"
+        )
+    tell = progress or (lambda text, share: None)
+    with threadpool_limits(1, "blas"):
+        return _identify(rate, time, restart, present, tell)
+
+
+def _identify(rate, time, restart, present, tell) -> IdentifiedNoise:
+    steps = np.diff(time)[~restart[1:]]
+    interval, span = float(np.median(steps)), float(steps.sum())
+    scale = float(rate[present].std())
+    y = (rate - rate[present].mean()) / scale
+    clean = _longest(present & _regular(time, restart, interval))
+    tell("lines", 0.0)
+    frequencies = np.asarray(find_lines(y[clean], time[clean], interval))
+    more, frequencies = len(frequencies) > MOST_LINES, frequencies[:MOST_LINES]
+    bias = (np.cumsum(restart)[:, None] == np.arange(1, restart.sum() + 1)).astype(float)
+    waves = line_columns(frequencies, time)
+    sizes = np.linalg.lstsq(np.column_stack([bias, waves])[present], y[present], rcond=None)[0][bias.shape[1] :]
+    y = y - waves @ sizes
+    if present.sum() > MOST_ROWS:  # means of groups hold nothing of fast lines
+        waves = waves[:, np.repeat(frequencies < SLOW_LINE / interval, 2)]
+    start = _start(with_gaps(y, time, restart, interval), interval)
+    tell("trend", 0.1)
+    trend = (time - time[present].mean()) / span
+    columns = np.column_stack([bias, waves])
+    level, tilted = (
+        Fits(reduced(time, y, x, restart, interval), interval, span, start)
+        for x in (columns, np.column_stack([columns, trend]))
+    )
+    ramp, slope = _ramp(level, tilted)
+    found = ramp.verdict == "found"
+    fits, y = (tilted, y - slope * trend) if found else (level, y)
+    tell("kinds of noise", 0.3)
+    chosen = _choose(fits)
+    tell("intervals", 0.6)
+    units = (interval**0.5, interval, 1.0, 1.0, 1.0)
+    terms = {KINDS[k]: t.scaled(scale * units[k]) for k, t in _terms(fits, chosen).items()}
+    terms["noise_rate_ramp"] = ramp.scaled(scale / span)
+    seen = spectrum(y[clean], interval)
+    errors = np.sqrt(2.0 * np.interp(frequencies, seen.frequency, background(seen.power)) / span) * scale
+    lines = zip(frequencies, np.hypot(*sizes.reshape(-1, 2).T) * scale, errors, strict=True)
+    misfits = _misfits(fits.mixture(fits.found[chosen][0][None]), seen, interval)
+    tell("identified", 1.0)
+    order = (*KINDS, "noise_rate_ramp")
+    return IdentifiedNoise({k: terms[k] for k in order}, tuple(Line(*map(float, x)) for x in lines), more, misfits)
+
+
+def _longest(good: np.ndarray) -> slice:
+    """The longest stretch of rows that are all good."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]])))
+    first, last = ends[::2], ends[1::2]
+    k = int(np.argmax(last - first))
+    return slice(int(first[k]), int(last[k]))
+
+
+def _regular(time: np.ndarray, restart: np.ndarray, interval: float) -> np.ndarray:
+    """Rows that follow the one before at the nominal interval."""
+    return ~restart & (np.diff(time, prepend=time[0]) < GAP * interval)
+
+
+def with_gaps(rate: np.ndarray, time: np.ndarray, restart: np.ndarray, interval: float) -> np.ndarray:
+    """The rate with one missing sample where time leaves a gap, as `deviation` takes it."""
+    return np.insert(rate, np.flatnonzero(~_regular(time, restart, interval))[1:], np.nan)
+
+
+def _start(rate: np.ndarray, interval: float) -> np.ndarray:
+    """Parameters at which each kind by itself would reach half of the Allan variance where it comes nearest to it."""
+    seen = deviation(rate, interval)
+    variance, m = seen.deviation**2, seen.length
+    largest = [variance * m, variance * m**2 / 3.0, variance * np.pi / (2.0 * np.log(2.0)), 3.0 * variance / seen.tau]
+    return np.log(0.5 * np.array([*(x.min() for x in largest), largest[3].min(), 1.0]))
+
+
+def _ramp(level: Fits, tilted: Fits) -> tuple[NoiseTerm, float]:
+    """The trend over the record beside white noise, quantisation and random walk, and its signed size."""
+    gain = 0.0
+    for sign, fits in ((-2.0, level), (2.0, tilted)):
+        # Restricted likelihoods of different regressors do not compare.
+        free = Fits(fits.record._replace(restricted=False), fits.interval, fits.span, fits.start)
+        free.fit([UNFLICKERING])
+        gain += sign * free.found[UNFLICKERING][1]
+    tilted.fit([UNFLICKERING])
+    value, covariance = tilted.record.regression(tilted.mixture(tilted.found[UNFLICKERING][0][None]))
+    size, margin = abs(float(value[-1])), TWO_SIDED * float(np.sqrt(covariance[-1, -1]))
+    if gain > TREND:
+        return NoiseTerm(size, size - margin, size + margin, "found"), float(value[-1])
+    return NoiseTerm(size, 0.0, size + margin, "not identifiable"), 0.0
+
+
+def _choose(fits: Fits) -> Model:
+    """Fit all mixtures that may matter, and take the one whose kinds are all worth their price."""
+    subsets = [(*m, False) for m in product((False, True), repeat=4) if any(m)]
+    fits.fit([m for m in subsets if m[WHITE]] + [NOT_WHITE])
+    if fits.found[BROWN][1] - fits.found[NOT_WHITE][1] < CERTAIN:
+        fits.fit(subsets)
+    chosen = fits.best()
+    _try_markov(fits, chosen)
+    chosen = fits.best()
+    if chosen[MARKOV]:  # the kinds beside it may change their places
+        x = fits.found[chosen][0]
+        others = [_flipped(chosen, k) for k in range(MARKOV)]
+        fits.fit(others, [np.where(np.isfinite(x), x, fits.start) for _ in others])
+        chosen = fits.best()
+    return chosen
+
+
+def _try_markov(fits: Fits, chosen: Model) -> None:
+    """Add a Markov process to the chosen kinds, and in place of the slow ones, from the likeliest time constants."""
+    for model in {chosen, (*chosen[:FLICKER], False, False, False)} - {(False,) * 5}:
+        fits.fit([model])
+        constants = np.linspace(fits.low[TIME_CONSTANT] + 1.0, fits.high[TIME_CONSTANT] - 1.0, 8)
+        points = np.tile(fits.found[model][0], (len(constants), 1))
+        points[:, TIME_CONSTANT] = constants
+        # At the level where its Allan variance, about q²Tc/5 at 2 Tc, is half of what is seen there.
+        seen = fits.variance_at(1.89 * np.exp(constants))
+        points[:, MARKOV] = np.log(0.5 * seen / 0.191) - constants
+        nearest = np.argsort(fits.log_likelihood(points))[-2:]
+        fits.fit([(*model[:MARKOV], True)] * 2, list(points[nearest]))
+
+
+def _flipped(model: Model, k: int) -> Model:
+    return tuple(held != (i == k) for i, held in enumerate(model))
+
+
+def _terms(fits: Fits, chosen: Model) -> dict[int, NoiseTerm]:
+    """Value, interval and verdict of each kind, in units of the record and its sample interval."""
+    best = fits.best()
+    top = fits.found[best][1]
+    others: dict[int, list[Model]] = {}
+    peers: dict[int, Model] = {}  # the best model without, or with, each kind
+    for k in range(len(KINDS)):
+        # A Markov process of long time constant is a random walk: it rivals the others only where it does better.
+        rivals = [m for m, (_, value) in fits.found.items() if m[MARKOV] <= chosen[MARKOV] or value > top + BETTER]
+        others[k] = [m for m in (fits.found if k == MARKOV else rivals) if m[k] != chosen[k]]
+        if others[k]:
+            peers[k] = max(others[k], key=fits.penalised)
+    verdict: dict[int, Verdict] = {}
+    alternatives: dict[int, tuple[str, ...]] = {}
+    for k in range(len(KINDS)):
+        price = THRESHOLD if k < MARKOV else MARKOV_THRESHOLD
+        peer = peers.get(k)
+        gap = top - max((fits.found[m][1] for m in others[k]), default=-np.inf)
+        swapped = peer is not None and any(chosen[j] and not peer[j] for j in range(len(KINDS)))
+        near = peer is not None and 2.0 * (fits.penalised(best) - fits.penalised(peer)) < price
+        if chosen[k]:
+            verdict[k] = "found" if 2.0 * gap > price else "ambiguous"
+            alternatives[k] = tuple(KINDS[j] for j in range(5) if peer and peer[j] and not chosen[j])
+        else:
+            verdict[k] = "ambiguous" if swapped and near and k != MARKOV else "not identifiable"
+            alternatives[k] = tuple(KINDS[j] for j in range(5) if peer and chosen[j] and not peer[j])
+    union = tuple(verdict[k] != "not identifiable" for k in range(len(KINDS)))
+    fits.fit([union], [_joined(fits, chosen, peers, union)])
+    shown = [k for k in range(len(KINDS)) if union[k]]
+    low = dict(zip(shown, fits.ends(union, shown, TWO_SIDED, [False] * len(shown)), strict=True))
+    high = dict(zip(shown, fits.ends(union, shown, TWO_SIDED, [True] * len(shown)), strict=True))
+    out: dict[int, NoiseTerm] = {}
+    for k in range(len(KINDS)):
+        model = chosen if chosen[k] else peers.get(k, chosen)
+        point = fits.found[model][0]
+        if k == MARKOV and not union[k]:
+            # Without a time constant there is no bound: white noise and random walk are its limits.
+            out[k] = NoiseTerm(0.0, 0.0, float("inf"), "not identifiable")
+            continue
+        if not union[k]:
+            wider = tuple(u or i == k for i, u in enumerate(union))
+            fits.fit([wider], [np.where(np.isfinite(fits.found[union][0]), fits.found[union][0], fits.start - 2.0)])
+            low[k], high[k] = -np.inf, fits.ends(wider, [k], ONE_SIDED, [True])[0]
+            point = fits.found[wider][0]
+        value, floor, ceiling = np.exp(0.5 * np.array([point[k], low[k], high[k]]))
+        constant = float(np.exp(point[TIME_CONSTANT])) if k == MARKOV else float("nan")
+        if verdict[k] == "found" and floor == 0.0:
+            verdict[k] = "ambiguous"
+        said = alternatives[k] if verdict[k] == "ambiguous" else ()
+        out[k] = NoiseTerm(float(value), float(floor), float(ceiling), verdict[k], said, constant)
+    return out
+
+
+def _joined(fits: Fits, chosen: Model, peers: dict[int, Model], union: Model) -> np.ndarray:
+    """A start for the kinds of several models together."""
+    x = fits.found[chosen][0].copy()
+    for k, peer in peers.items():
+        if union[k] and not chosen[k]:
+            x[k] = fits.found[peer][0][k] - 1.0
+            if k == MARKOV:
+                x[TIME_CONSTANT] = fits.found[peer][0][TIME_CONSTANT]
+    return x
+
+
+def _misfits(noise: Mixture, seen: Spectrum, interval: float) -> tuple[tuple[float, float, float], ...]:
+    """Bands where the spectrum is not the model's: from, to (Hz), measured over fitted power."""
+    omega = 2.0 * np.pi * seen.frequency * interval
+    difference = 4.0 * np.sin(0.5 * omega) ** 2
+    phi, variance = noise.correlation[:, 0, None], noise.variance[:, 0, None]
+    fitted = noise.white[0] + noise.differenced[0] * difference + noise.walk[0] / difference
+    fitted = fitted + (variance * (1.0 - phi**2) / ((1.0 - phi) ** 2 + phi * difference)).sum(0)
+    ratio = (seen.power / (fitted * interval))[FIRST_IN_BIN:]
+    frequency = seen.frequency[FIRST_IN_BIN:]
+    if len(ratio) < 2 * FEWEST_IN_BIN:
+        return ()
+    edges = np.unique(np.geomspace(FEWEST_IN_BIN, len(ratio), BINS).astype(int))
+    edges = np.concatenate([[0], edges[np.diff(edges, prepend=-FEWEST_IN_BIN) >= FEWEST_IN_BIN]])
+    edges[-1] = len(ratio)
+    count = np.diff(edges)
+    mean = np.add.reduceat(ratio, edges[:-1]) / count
+    error = np.sqrt(HANN / count)
+    chance = 2.0 * norm.sf(np.abs(mean - 1.0) / error) * len(count)
+    bad = (chance < BY_CHANCE) & (np.abs(np.log(np.maximum(mean, 1e-300))) > np.log(MISFIT))
+    last = np.append(frequency, frequency[-1])[edges[1:] - 1]
+    return tuple((float(a), float(b), float(r)) for a, b, r in zip(frequency[edges[:-1]][bad], last[bad], mean[bad], strict=True))
