@@ -40,7 +40,7 @@ def campaign(rng: np.random.Generator, *names: str) -> Campaign:
     columns = {"time": np.arange(ROWS) * 20.0, "output": 1500 * rng.uniform(-1.2, 1.2, ROWS)}
     units = {"time": "s", "output": "count/s"}
     columns["temperature"], units["temperature"] = 25 + 15 * np.sin(columns["time"] / 300), "degC"
-    for name in set(names) - {"time", "rate", "temperature"}:
+    for name in {name.replace("<place>", "coil") for name in names} - {"time", "rate", "temperature"}:
         columns[name], units[name] = rng.uniform(0.5, 1.5, ROWS), usual_unit(name)
     return Campaign(columns, units, {"kind": "rate", "time_since_power_on": 40.0})
 
@@ -90,8 +90,9 @@ def members_of(measured: Campaign) -> dict[str, np.ndarray]:
     values = {name: np.asarray(v)[: record.rows] for name, v in record.signals.items()}
     named = {
         "output_count_per_s": values["output"], "time_s": values["time"], "time_on_s": values["time_on"],
-        "temperature_degC": values["temperature"], "temperature_rate_degC_per_s": values["temperature_rate"],
+        "temperature_degC": values["temperature"],
     }  # fmt: skip
+    named |= {f"{name}_degC_per_s": v for name, v in values.items() if name.endswith("_rate")}
     for name in measured.covariates:
         unit = internal_unit(measured.units[name]).replace("/", "_per_").replace("^", "")
         named[f"{name}_{unit or 'number'}"] = values[name]

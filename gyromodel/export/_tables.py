@@ -27,12 +27,15 @@ FORMULA = (
 
 
 class Entry(NamedTuple):
-    """One number of a calibration in its reporting unit, and internally; `std` is NaN where there is none."""
+    """One number of a calibration in its reporting unit, and internally, or the name of a column it depends on.
+
+    `std` is NaN where there is none.
+    """
 
     effect: str
     kind: Literal["parameter", "fixed", "setting", "noise"]
     name: str
-    value: float
+    value: float | str
     std: float
     unit: str
     internal: float
@@ -53,8 +56,10 @@ def entries(calibration: Calibration) -> list[list[Entry]]:
             unit = column_unit(effect) if isinstance(effect, BiasColumn) else SETTING_UNITS.get(name, "")
             values = np.ravel(getattr(effect, name))
             for shown, internal in zip(shown_names(name, len(values)), values, strict=True):
-                value = float(from_internal(internal, unit))
-                group.append(Entry(effect.label, "setting", shown, value, math.nan, unit, float(internal)))
+                text = isinstance(internal, str)
+                value = str(internal) if text else float(from_internal(internal, unit))
+                internal = math.nan if text else float(internal)
+                group.append(Entry(effect.label, "setting", shown, value, math.nan, unit, internal))
         found.append(group)
     return found
 
