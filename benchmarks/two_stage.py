@@ -15,7 +15,7 @@ import numpy as np
 from benchmarks._measure import table, timed, write_result
 from gyromodel.multiposition import rate_table, six_positions
 from gyromodel.numerics.uncertain import Uncertain, together
-from gyromodel.temperature_models import Calibration, Soaks, fit_currents, fit_jointly
+from gyromodel.temperature_models import Soaks, ThermistorReadings, fit_currents, fit_jointly
 from gyromodel.thermometry import fit_thermistor
 from gyromodel.units import factor
 from tests.truth import rate_integrating as truth
@@ -36,7 +36,7 @@ class Campaign(NamedTuple):
     """What the fits take, in internal units."""
 
     soaks: Soaks
-    calibration: Calibration
+    calibration: ThermistorReadings
     reading: Uncertain
 
 
@@ -52,7 +52,7 @@ def prepared(unit: truth.Unit, rng: np.random.Generator) -> Campaign:
         np.array([0] * 2 + [1] * 6),
         ("table currents", "position currents"),
     )
-    calibration = Calibration(found.calibration_resistance, found.calibration_temperature, found.soak_resistance)
+    calibration = ThermistorReadings(found.calibration_resistance, found.calibration_temperature, found.soak_resistance)
     reading = Uncertain.stated(jnp.zeros(len(currents)), unit.reading_noise**2, "resistance reading")
     return Campaign(soaks, calibration, reading)
 

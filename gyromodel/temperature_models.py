@@ -212,7 +212,7 @@ class Soaks(NamedTuple):
     names: tuple[str, ...]
 
 
-class Calibration(NamedTuple):
+class ThermistorReadings(NamedTuple):
     """Readings of a thermistor (ohm) beside a reference thermometer (°C), and in the soaks of a gyro."""
 
     resistance: Float[Array | np.ndarray, " point"]
@@ -248,7 +248,7 @@ def fit_currents(soaks: Soaks, temperature: Temperature) -> FunctionFit:
 
 def fit_jointly(
     soaks: Soaks,
-    calibration: Calibration,
+    readings: ThermistorReadings,
     start: FunctionFit,
     given: Uncertain | None = None,
     name: str = "thermometry",
@@ -257,7 +257,7 @@ def fit_jointly(
 
     Args:
         soaks: the currents.
-        calibration: the resistances.
+        readings: the resistances.
         start: `fit_thermistor` of the calibration, whose segments and continuity are kept.
         given: errors of ln R in the soaks, values of zero with their uncertainty.
         name: what the calibration is called in budgets.
@@ -266,14 +266,14 @@ def fit_jointly(
         The fit; its value is the `Thermistor` and a `StaticModel` of lines.
     """
     terms = start.value.terms
-    points, segments = len(calibration.resistance), terms[1].shape[0]
-    t = np.asarray(start.value.temperature(jnp.asarray(calibration.soaks)))
-    segment = segments - 1 - (np.asarray(calibration.resistance) > float(start.value.reference)) * (segments - 1)
-    data = (start.value.reference, *(jnp.asarray(r) for r in (calibration.resistance, calibration.soaks)))
+    points, segments = len(readings.resistance), terms[1].shape[0]
+    t = np.asarray(start.value.temperature(jnp.asarray(readings.soaks)))
+    segment = segments - 1 - (np.asarray(readings.resistance) > float(start.value.reference)) * (segments - 1)
+    data = (start.value.reference, *(jnp.asarray(r) for r in (readings.resistance, readings.soaks)))
     fit = fit_function(
         _predicted_readings,
         (terms, _start(soaks, t)),
-        np.concatenate([calibration.temperature, np.ravel(soaks.currents)]),
+        np.concatenate([readings.temperature, np.ravel(soaks.currents)]),
         (data, soaks.conditions),
         given=given,
         std=np.concatenate([np.ones(points), np.tile(soaks.std, len(t))]),

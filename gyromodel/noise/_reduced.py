@@ -26,7 +26,8 @@ CELLS = 32
 
 class Mixture(NamedTuple):
     """Noises side by side on the last axis: variances of a sample of white and of differenced noise, of a step of the
-    random walk, and Markov processes by the correlation of neighbouring samples and their variance."""
+    random walk, and Markov processes by the correlation of neighbouring samples and their variance.
+    """
 
     white: np.ndarray
     differenced: np.ndarray
