@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from gyromodel.model import simulate as simulate
     from gyromodel.model_files import read_model as read_model
     from gyromodel.model_files import write_model as write_model
+    from gyromodel.noise_analysis import analyse_noise as analyse_noise
     from gyromodel.report import write_report as write_report
     from gyromodel.units import UnitError as UnitError
 
@@ -42,6 +43,7 @@ _MODULE_OF = {
     "Estimate": "estimate",
     "GyroModel": "model",
     "UnitError": "units",
+    "analyse_noise": "noise_analysis",
     "diagnose": "diagnosis",
     "fit": "estimate",
     "model_from_effects": "model",
