@@ -245,7 +245,7 @@ def test_diagnose_writes_its_results(bench: Path, run: Run):
 
 
 def test_allan_writes_deviations_and_coefficients(bench: Path, run: Run):
-    """Of the simulated campaign's 0.02 deg/sqrt(h) at 20 s; the motion is in the way, so the gyro is simulated at rest."""
+    """Of the simulated gyro with 0.02 deg/sqrt(h), but at rest: the motion would be in the way."""
     rest = PLAN.replace(
         "rate:\n    - repeat: 6\n      segments: [{for: 10 min, at: 10 deg/s}, {for: 10 min, at: -10 deg/s}]",
         "rate: 0 deg/s",

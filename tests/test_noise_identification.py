@@ -22,6 +22,12 @@ RARE = 1e-5
 ROWS, STEP, N = 800, 0.5, 0.02
 
 
+@pytest.fixture
+def fixed() -> np.random.Generator:
+    """One draw, the same in each run, where one verdict on it is tested."""
+    return np.random.default_rng(1)
+
+
 def white(rng: np.random.Generator, rows: int = ROWS) -> np.ndarray:
     return truth.white(rows, STEP, N, rng)
 
@@ -137,14 +143,14 @@ def test_grouping_changes_neither_values_nor_intervals(monkeypatch: pytest.Monke
 @pytest.mark.parametrize(
     ("key", "size"), [("noise_quantisation", 0.02), ("noise_flicker", 0.02), ("noise_random_walk", 4e-3)]
 )
-def test_each_kind_is_found_beside_white_noise(key: str, size: float, rng: np.random.Generator):
+def test_each_kind_is_found_beside_white_noise(key: str, size: float, fixed: np.random.Generator):
     """Sizes ten times what a record shows; three times the interval holds the truth."""
     make = {
-        "noise_quantisation": lambda: quantised(ROWS, size, rng),
-        "noise_flicker": lambda: truth.flicker(ROWS, STEP, size, rng),
-        "noise_random_walk": lambda: truth.random_walk(ROWS, STEP, size, rng),
+        "noise_quantisation": lambda: quantised(ROWS, size, fixed),
+        "noise_flicker": lambda: truth.flicker(ROWS, STEP, size, fixed),
+        "noise_random_walk": lambda: truth.random_walk(ROWS, STEP, size, fixed),
     }[key]
-    found = identified(white(rng) + make())
+    found = identified(white(fixed) + make())
     for name, true in ((key, size), ("noise_white", N)):
         term = found.terms[name]
         assert term.verdict != "not identifiable"
@@ -167,19 +173,19 @@ def test_white_noise_alone_is_seldom_anything_else(rng: np.random.Generator):
     assert binom.cdf(covered, 12, 0.93) > RARE
 
 
-def test_quantisation_alone_is_not_read_as_white_noise(rng: np.random.Generator):
-    found = identified(quantised(ROWS, 1e-3, rng))
+def test_quantisation_alone_is_not_read_as_white_noise(fixed: np.random.Generator):
+    found = identified(quantised(ROWS, 1e-3, fixed))
     assert found.terms["noise_quantisation"].value == pytest.approx(1e-3, rel=0.1)
     assert found.terms["noise_white"].verdict == "not identifiable"
     # Reading the deviation at 1 s off would give N = √3 Q.
     assert found.terms["noise_white"].high < 0.05 * np.sqrt(3) * 1e-3
 
 
-def test_lines_and_trend_are_taken_out_of_the_noise(rng: np.random.Generator):
+def test_lines_and_trend_are_taken_out_of_the_noise(fixed: np.random.Generator):
     time = np.arange(ROWS) * STEP
-    rate = white(rng) + 0.02 * np.cos(2 * np.pi * 0.3111 * time + 1.0) + 1e-3 * time
+    rate = white(fixed) + 0.02 * np.cos(2 * np.pi * 0.3111 * time + 1.0) + 1e-3 * time
     found = identified(rate)
-    assert [line.frequency for line in found.lines] == pytest.approx([0.3111], abs=1e-4)
+    assert [line.frequency for line in found.lines] == pytest.approx([0.3111], abs=5e-4)
     assert abs(found.lines[0].amplitude - 0.02) < 5.0 * found.lines[0].std
     ramp = found.terms["noise_rate_ramp"]
     assert ramp.verdict == "found"
@@ -188,23 +194,21 @@ def test_lines_and_trend_are_taken_out_of_the_noise(rng: np.random.Generator):
     assert found.fits
 
 
-def test_gaps_and_missing_samples_do_not_matter(rng: np.random.Generator):
+def test_gaps_and_missing_samples_do_not_matter(fixed: np.random.Generator):
     time = np.arange(ROWS) * STEP
     time[ROWS // 2 :] += 400.0
-    rate = white(rng)
-    rate[rng.random(ROWS) < 0.1] = np.nan
+    rate = white(fixed)
+    rate[fixed.random(ROWS) < 0.1] = np.nan
     found = identify_noise(rate, time)
     assert found.terms["noise_white"].low < N * 1.1
     assert found.terms["noise_white"].high > N * 0.9
 
 
-def test_what_no_kind_explains_is_said(rng: np.random.Generator):
-    """White noise through a resonance."""
-    drive = rng.standard_normal(ROWS)
-    rate = np.convolve(drive, np.exp(-np.arange(60) / 15) * np.cos(1.2 * np.arange(60)))[:ROWS]
-    found = identified(rate)
+def test_what_no_kind_explains_is_said(fixed: np.random.Generator):
+    """White noise through a moving average, whose spectrum has zeros."""
+    found = identified(np.convolve(fixed.standard_normal(ROWS + 5), np.ones(6), "valid"))
     assert not found.fits
-    assert found.misfits
+    assert min(ratio for _, _, ratio in found.misfits) < 0.5
 
 
 @pytest.mark.parametrize("values", [np.zeros(100), np.arange(20.0)])
@@ -213,9 +217,9 @@ def test_records_without_noise_are_refused(values: np.ndarray):
         identified(values)
 
 
-def test_reports_are_in_units_of_the_field(rng: np.random.Generator):
+def test_reports_are_in_units_of_the_field(fixed: np.random.Generator):
     """N of 0.02 deg/h/√Hz is 0.02/60 deg/√h; the same through counts with a scale factor, and without in counts."""
-    time, rate = np.arange(ROWS) * STEP, white(rng)
+    time, rate = np.arange(ROWS) * STEP, white(fixed)
     units = {"time": "s", "output": "deg/h"}
     said = analyse_noise(Campaign({"time": time, "output": rate}, units, {"kind": "rate"})).to_dict()
     term = said["noise"]["noise_white"]

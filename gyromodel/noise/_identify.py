@@ -34,8 +34,8 @@ from gyromodel.noise._reduced import MOST_ROWS, Mixture, reduced
 Verdict = Literal["found", "ambiguous", "not identifiable"]
 
 KINDS = ("noise_white", "noise_quantisation", "noise_flicker", "noise_random_walk", "noise_markov")
-# Square root of twice the log likelihood ratio at the ends of a 95 % interval, and at a 95 % upper bound: one that holds
-# even where slow noise shows itself in a single degree of freedom, χ²₁ < r with r − 1 − ln r = 2.13² in 5 % of records.
+# Square root of twice the log likelihood ratio at the ends of a 95 % interval, and at a 95 % upper bound, which holds
+# even where slow noise shows in a single degree of freedom: χ²₁ < r, with r − 1 − ln r = 2.13², in 5 % of records.
 TWO_SIDED, BOUND = 1.960, 2.13
 # The same for a trend, which a random walk imitates: in 150 records each without a trend, at five sizes of the walk, it
 # exceeded 12 once.

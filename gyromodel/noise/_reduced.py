@@ -72,8 +72,10 @@ class Level(NamedTuple):
         lag = np.abs(np.subtract.outer(np.arange(rows), np.arange(rows)))
         total = self.contrasts @ noise.covariance(rows).T[:, lag] @ self.contrasts.T
         sign, log_determinant = np.linalg.slogdet(total)
+        good = (sign > 0) & np.isfinite(log_determinant)
+        total = np.where(good[:, None, None], total, np.eye(rows - 1))
         misfit = np.trace(np.linalg.solve(total, self.moments), axis1=1, axis2=2)
-        good = (sign > 0) & (misfit > 0)
+        good &= misfit > 0
         return np.where(good, -0.5 * (self.groups * log_determinant + misfit), -np.inf)
 
 
@@ -132,8 +134,12 @@ class Reduced(NamedTuple):
 def _solved(gram: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """ln |XᵀV⁻¹X| and the residual sum of squares, the data being the last column."""
     a, b, c = gram[:, :-1, :-1], gram[:, :-1, -1], gram[:, -1, -1]
-    with np.errstate(all="ignore"):
-        return np.linalg.slogdet(a)[1], c - np.einsum("gi,gi->g", b, np.linalg.solve(a, b[..., None])[..., 0])
+    with np.errstate(invalid="ignore"):  # what is no covariance comes out as no number
+        sign, log_x = np.linalg.slogdet(a)
+    good = (sign > 0) & np.isfinite(log_x)
+    a = np.where(good[:, None, None], a, np.eye(a.shape[1]))
+    rss = c - np.einsum("gi,gi->g", b, np.linalg.solve(a, b[..., None])[..., 0])
+    return np.where(good, log_x, np.inf), rss
 
 
 def reduced(

@@ -86,7 +86,7 @@ def _drawn(analysis: NoiseAnalysis) -> str:
     axes.set_xlabel(draw.axis_label("averaging time", "s", 0))
     axes.set_ylabel(draw.axis_label("Allan deviation", analysis.unit, 0))
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter(_power)
+        axis.set_major_formatter(lambda value, _: _power(value))
         axis.set_minor_formatter("")
     draw.legend(axes, 2)
     return draw.rendered(figure, "allan")
@@ -118,7 +118,7 @@ def _name(axes: Axes, name: str, tau: np.ndarray, term: np.ndarray, total: np.nd
     )
 
 
-def _power(value: float, position: float) -> str:
+def _power(value: float) -> str:
     """A power of ten as a label, without the mathematics that other texts of the figure might trigger."""
     exponent = round(np.log10(value))
     return f"{value:g}" if -3 <= exponent <= 4 else f"10{str(exponent).translate(_SUPERSCRIPTS)}"
