@@ -12,6 +12,7 @@ from gyromodel.campaign import Campaign
 from gyromodel.files import read_campaign
 from gyromodel.noise import IdentifiedNoise, identify_noise
 from gyromodel.noise import _reduced as reduction
+from gyromodel.noise._identify import KINDS
 from gyromodel.noise._reduced import Mixture
 from gyromodel.noise_analysis import analyse_noise
 from gyromodel.numerics.markov_cells import MarkovCells, Rows, log_determinant_and_gram
@@ -238,11 +239,11 @@ def test_reports_are_in_units_of_the_field(fixed: np.random.Generator):
     assert scaled.to_dict()["noise"]["noise_white"]["value"] == pytest.approx(term["value"], rel=1e-3)
 
 
-def test_dithered_ring_laser_log_is_not_called_white(measured_data):
+@pytest.mark.parametrize("axis", ["y", "z"])
+def test_dithered_ring_laser_log_is_not_called_white(axis: str, measured_data):
     """Its deviation falls as 1/τ, with dither lines folded into the band: white noise must not be read off it."""
-    log = read_campaign(measured_data("rlg_static/campaign.csv.gz")).axis("z")
+    log = read_campaign(measured_data("rlg_static/campaign.csv.gz")).axis(axis)
     analysis = analyse_noise(log.select(slice(0, 1200)))
-    found = analysis.noise
-    assert not found.fits
-    assert found.terms["noise_white"].verdict == "not identifiable"
+    assert not analysis.noise.fits
+    assert not {"found", "ambiguous"} & {analysis.noise.terms[key].verdict for key in KINDS if key != "noise_flicker"}
     assert any("not of these kinds" in remark for remark in analysis.remarks)

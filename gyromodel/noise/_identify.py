@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import norm
+from scipy.stats import chi2, gamma, norm
 from threadpoolctl import threadpool_limits
 
 from gyromodel.noise._deviation import Deviation, deviation
@@ -31,7 +31,7 @@ from gyromodel.noise._fits import (
 from gyromodel.noise._lines import MOST_LINES, Spectrum, background, find_lines, line_columns, spectrum
 from gyromodel.noise._reduced import MOST_ROWS, Mixture, reduced
 
-Verdict = Literal["found", "ambiguous", "not identifiable"]
+Verdict = Literal["found", "ambiguous", "doubtful", "not identifiable"]
 
 KINDS = ("noise_white", "noise_quantisation", "noise_flicker", "noise_random_walk", "noise_markov")
 # Square root of twice the log likelihood ratio at the ends of a 95 % interval, and at a 95 % upper bound, which holds
@@ -40,8 +40,9 @@ TWO_SIDED, BOUND = 1.960, 2.13
 # The same for a trend, which a random walk imitates: in 150 records each without a trend, at five sizes of the walk, it
 # exceeded 12 once.
 TREND = 12.0
-# Frequencies per bin of the whitened spectrum; their mean may miss one by this factor, and by chance this seldom.
-FEWEST_IN_BIN, BINS, MISFIT, BY_CHANCE = 24, 40, 1.25, 1e-4
+# Frequencies per bin of the whitened spectrum, and bins. All bins together contradict the model this seldom by chance;
+# those are named that miss it by this factor and this many standard deviations.
+FEWEST_IN_BIN, BINS, BY_CHANCE, MISFIT, APART = 24, 40, 1e-4, 1.25, 2.6
 # Loss of independent frequencies by the Hann window: 1 + 2 (4/9 + 1/36).
 HANN = 35.0 / 18.0
 FIRST_IN_BIN = 4
@@ -66,7 +67,8 @@ class NoiseTerm(NamedTuple):
 
     `value` with its 95 % limits where `verdict` is found; where it is ambiguous, the size if it is this kind rather
     than one of `alternatives`; where it is not identifiable, the record shows no more than the upper limit, at 95 %. Of
-    kinds that stand for one another only one is `in_model`. A Markov process has its time constant (s) beside it.
+    kinds that stand for one another only one is `in_model`. What would be found or ambiguous is doubtful where the
+    spectrum contradicts the model. A Markov process has its time constant (s) beside it.
     """
 
     value: float
@@ -205,6 +207,8 @@ def _identify(rate, time, restart, present, tell) -> IdentifiedNoise:
     errors = np.sqrt(2.0 * np.interp(frequencies, power.frequency, background(power.power)) / span) * scale
     lines = zip(frequencies, np.hypot(*sizes.reshape(-1, 2).T) * scale, errors, strict=True)
     misfits = _misfits(fits.mixture(fits.found[chosen][0][None]), power, interval)
+    if misfits or more:
+        terms |= {k: t._replace(verdict="doubtful") for k, t in terms.items() if k in KINDS and t.in_model}
     tell("identified", 1.0)
     order = (*KINDS, "noise_rate_ramp")
     return IdentifiedNoise(
@@ -371,14 +375,18 @@ def _misfits(noise: Mixture, seen: Spectrum, interval: float) -> tuple[tuple[flo
     frequency = seen.frequency[FIRST_IN_BIN:]
     if len(ratio) < 2 * FEWEST_IN_BIN:
         return ()
-    edges = np.unique(np.geomspace(FEWEST_IN_BIN, len(ratio), BINS).astype(int))
-    edges = np.concatenate([[0], edges[np.diff(edges, prepend=-FEWEST_IN_BIN) >= FEWEST_IN_BIN]])
-    edges[-1] = len(ratio)
+    edges = [0]
+    for edge in np.geomspace(FEWEST_IN_BIN, len(ratio), BINS).astype(int):
+        if edge - edges[-1] >= FEWEST_IN_BIN:
+            edges.append(int(edge))
+    edges = np.array([*edges[:-1], len(ratio)])
     count = np.diff(edges)
     mean = np.add.reduceat(ratio, edges[:-1]) / count
-    error = np.sqrt(HANN / count)
-    chance = 2.0 * norm.sf(np.abs(mean - 1.0) / error) * len(count)
-    bad = (chance < BY_CHANCE) & (np.abs(np.log(np.maximum(mean, 1e-300))) > np.log(MISFIT))
+    # Means of periodograms are gamma variables; as normal ones their squares add up to chi-squared.
+    shape = count / HANN
+    score = np.abs(norm.ppf(np.clip(gamma.cdf(mean * shape, shape), 1e-15, 1.0 - 1e-15)))
+    contradicted = chi2.sf(np.sum(score**2), len(score)) < BY_CHANCE
+    bad = contradicted & (score > APART) & (np.abs(np.log(np.maximum(mean, 1e-300))) > np.log(MISFIT))
     last = np.append(frequency, frequency[-1])[edges[1:] - 1]
     return tuple(
         (float(a), float(b), float(r)) for a, b, r in zip(frequency[edges[:-1]][bad], last[bad], mean[bad], strict=True)

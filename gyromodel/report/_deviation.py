@@ -46,6 +46,8 @@ def noise_rows(analysis: NoiseAnalysis) -> list[tuple[str, ...]]:
             verdict, high = (f"not identifiable: below {high} (95 %)", "–") if bounded else ("not identifiable", "–")
         elif verdict == "ambiguous" and term.alternatives:
             verdict = f"ambiguous: this or {' or '.join(_NAMES[name] for name in term.alternatives)}"
+        elif verdict == "doubtful":
+            verdict = "doubtful: the spectrum contradicts it"
         if key == "noise_markov" and term.in_model:
             verdict += f", time constant {term.time_constant:.3g} s"
         rows.append((_NAMES[key], SYMBOLS[key], value, low, high, unit, verdict))
