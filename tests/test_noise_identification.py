@@ -245,5 +245,5 @@ def test_dithered_ring_laser_log_is_not_called_white(axis: str, measured_data):
     log = read_campaign(measured_data("rlg_static/campaign.csv.gz")).axis(axis)
     analysis = analyse_noise(log.select(slice(0, 1200)))
     assert not analysis.noise.fits
-    assert not {"found", "ambiguous"} & {analysis.noise.terms[key].verdict for key in KINDS if key != "noise_flicker"}
+    assert not {"found", "ambiguous"} & {analysis.noise.terms[key].verdict for key in KINDS}
     assert any("not of these kinds" in remark for remark in analysis.remarks)

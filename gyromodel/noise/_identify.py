@@ -208,7 +208,11 @@ def _identify(rate, time, restart, present, tell) -> IdentifiedNoise:
     lines = zip(frequencies, np.hypot(*sizes.reshape(-1, 2).T) * scale, errors, strict=True)
     misfits = _misfits(fits.mixture(fits.found[chosen][0][None]), power, interval)
     if misfits or more:
-        terms |= {k: t._replace(verdict="doubtful") for k, t in terms.items() if k in KINDS and t.in_model}
+        terms |= {
+            k: t._replace(verdict="doubtful")
+            for k, t in terms.items()
+            if k in KINDS and t.verdict != "not identifiable"
+        }
     tell("identified", 1.0)
     order = (*KINDS, "noise_rate_ramp")
     return IdentifiedNoise(
