@@ -44,7 +44,9 @@ def _read_slopes(tau: np.ndarray, sigma: np.ndarray) -> tuple[float, float]:
 
 def _fit_curve(tau: np.ndarray, sigma: np.ndarray, freedom: np.ndarray, *, known: bool) -> tuple[float, float]:
     """N and K by non-negative least squares of the Allan variance, weighted by its own scatter."""
-    shapes = [1 / tau, tau / 3] if known else [1 / tau, tau / 3, 3 / tau**2, 2 * np.log(2) / np.pi + 0 * tau, tau**2 / 2]
+    shapes = (
+        [1 / tau, tau / 3] if known else [1 / tau, tau / 3, 3 / tau**2, 2 * np.log(2) / np.pi + 0 * tau, tau**2 / 2]
+    )
     weight = np.sqrt(freedom) / sigma**2
     squares = nnls(np.column_stack(shapes) * weight[:, None], sigma**2 * weight)[0]
     return float(np.sqrt(squares[0])), float(np.sqrt(squares[1]))
@@ -52,13 +54,14 @@ def _fit_curve(tau: np.ndarray, sigma: np.ndarray, freedom: np.ndarray, *, known
 
 def _oracle(log: np.ndarray) -> tuple[float, float]:
     """N and K of greatest restricted likelihood, told that there is nothing else."""
+    from gyromodel.noise import deviation
     from gyromodel.noise._fits import WALK, WHITE, Fits
     from gyromodel.noise._identify import _start
     from gyromodel.noise._reduced import reduced
 
     scale, time = log.std(), np.arange(ROWS) * STEP
-    record = reduced(time, log / scale, np.ones((ROWS, 1)), time == 0, STEP)
-    fits = Fits(record, STEP, ROWS * STEP, _start(log / scale, STEP))
+    record = reduced(time, log / scale, np.ones((ROWS, 1)), time == 0, STEP, ROWS)
+    fits = Fits(record, STEP, ROWS * STEP, _start(deviation(log / scale, STEP)))
     known = (True, False, False, True, False)
     fits.fit([known])
     x = scale * np.exp(0.5 * fits.found[known][0])
@@ -105,7 +108,7 @@ def main(argv: list[str] | None = None) -> None:
                 }
                 for method, (a, b) in results.items():
                     errors.setdefault(method, []).append((a / N - 1, b / K - 1))
-            print(truth, seed, f"{spent['wall']:.1f} s", n.verdict, k.verdict, file=sys.stderr, flush=True)
+            print(truth, seed, f"{spent['wall']:.1f} s", n[:4], k[:4], file=sys.stderr, flush=True)
     rms = {method: 100 * np.sqrt(np.mean(np.square(e), axis=0)) for method, e in errors.items()}
     rows = [[method, f"{a:.2f}", f"{b:.0f}"] for method, (a, b) in rms.items()]
     ids = [key for key in verdicts["white"][0] if key != "noise_white"]
@@ -114,12 +117,11 @@ def main(argv: list[str] | None = None) -> None:
         for truth, of in verdicts.items()
         for key in ids
     ]
-    coverage = [
-        [truth, *(_share(int(hits), len(of)) for hits in np.sum(of, axis=0))] for truth, of in covered.items()
-    ]
+    coverage = [[truth, *(_share(int(hits), len(of)) for hits in np.sum(of, axis=0))] for truth, of in covered.items()]
     lines = [
-        f"{seeds} logs of each kind, 6 h at 10 Hz: N = {N:g} deg/s/√Hz, with K = {K:g} deg/s^1.5, alone, or with B = {B:g} "
-        f"deg/s. One identification with its intervals took {np.median(seconds):.1f} s (median of {len(seconds)}).",
+        f"{seeds} logs of each kind, 6 h at 10 Hz: N = {N:g} deg/s/√Hz, with K = {K:g} deg/s^1.5, alone, or with "
+        f"B = {B:g} deg/s. One identification with its intervals took {np.median(seconds):.1f} s (median of "
+        f"{len(seconds)}).",
         "",
         "Root mean square errors with white noise and random walk:",
         "",

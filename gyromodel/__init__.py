@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from gyromodel.model_files import read_calibration as read_calibration
     from gyromodel.model_files import read_model as read_model
     from gyromodel.model_files import write_model as write_model
+    from gyromodel.noise_analysis import analyse_noise as analyse_noise
     from gyromodel.numerics.uncertain import Uncertain as Uncertain
     from gyromodel.numerics.uncertain import together as together
     from gyromodel.report import write_report as write_report
@@ -52,6 +53,7 @@ _MODULE_OF = {
     "Uncertain": "numerics.uncertain",
     "UnitError": "units",
     "compensate": "compensation",
+    "analyse_noise": "noise_analysis",
     "diagnose": "diagnosis",
     "export_calibration": "export",
     "fit": "estimate",

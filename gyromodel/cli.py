@@ -251,6 +251,32 @@ def export(
 
 
 @app.command()
+def allan(
+    campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign file of a gyro at rest.")],
+    output: Folder,
+    axis: Axis = None,
+    as_json: AsJson = False,
+) -> None:
+    """Allan deviation and noise coefficients with intervals, of a gyro at rest."""
+    output.mkdir(parents=True, exist_ok=True)
+    from gyromodel.noise_analysis import analyse_noise
+    from gyromodel.report import deviation_figure, noise_rows
+
+    [measured] = _read([campaign], axis)
+    with _progress() as progress:
+        analysis = analyse_noise(measured, progress=progress)
+    result = analysis.to_dict()
+    write_text(output / "allan.json", _json(result))
+    write_text(output / "allan.svg", deviation_figure(analysis))
+    if as_json:
+        print(_json(result), end="")
+        return
+    _print_table(("noise", "", "value", "95 % from", "to", "unit", "verdict"), noise_rows(analysis))
+    print("".join(f"\n{remark}\n" for remark in analysis.remarks), end="")
+    _print_paths(output, "allan.json", "allan.svg")
+
+
+@app.command()
 def effects(
     effect: Annotated[str | None, typer.Argument(metavar="ID", help="One effect, in full.", show_default=False)] = None,
     as_json: AsJson = False,

@@ -20,7 +20,7 @@ import pytest
 from gyromodel import cli
 from gyromodel.files import read_campaign
 
-COMMANDS = ("demo", "fit", "diagnose", "simulate", "compensate", "export", "effects")
+COMMANDS = ("demo", "fit", "diagnose", "simulate", "compensate", "export", "allan", "effects")
 HEAVY = {"jax", "equinox", "numpy", "pandas", "pint", "matplotlib", "xarray", "scipy", "rich"}
 
 PLAN = """\
@@ -149,6 +149,8 @@ def test_the_module_runs_as_a_program():
         ["compensate", "m.yaml", "-o", "out.csv"],
         ["export", "m.yaml"],
         ["export", "m.yaml", "--to", "fortran"],
+        ["allan", "campaign.csv"],
+        ["allan", "campaign.csv", "-o", "out", "--axis", "w"],
         ["effects", "bias_temprature"],
         ["effects", "--unknown"],
     ],
@@ -337,6 +339,41 @@ def test_diagnose_writes_its_results(bench: Path, run: Run):
     for name in ("report.html", "diagnosis.json", "model.yaml"):
         assert str(out / name) in done.out
     assert not [path for path in out.rglob("*") if path.name.startswith(".")]
+
+
+def test_allan_writes_deviations_and_coefficients(bench: Path, run: Run):
+    """Of the simulated gyro with 0.02 deg/sqrt(h), but at rest: the motion would be in the way."""
+    rest = PLAN.replace(
+        "rate:\n    - repeat: 6\n      segments: [{for: 10 min, at: 10 deg/s}, {for: 10 min, at: -10 deg/s}]",
+        "rate: 0 deg/s",
+    )
+    (bench / "rest.yaml").write_text(rest, encoding="utf-8")
+    made = run("simulate", bench / "truth.yaml", "--plan", bench / "rest.yaml", "-o", bench / "rest.csv")
+    assert made.status == 0, made.err
+    done = run("allan", bench / "rest.csv", "-o", bench / "noise")
+    assert done.status == 0, done.err
+    for part in ("white", "random walk", "not identifiable: below", "count/s", "allan.json", "allan.svg"):
+        assert part in done.out, part
+    said = json.loads((bench / "noise" / "allan.json").read_text(encoding="utf-8"))
+    assert set(said["deviations"]) == {"allan", "modified", "hadamard", "total"}
+    white = said["noise"]["noise_white"]
+    assert white["verdict"] == "found"
+    assert abs(white["value"] / (1000 * 0.02 / 60) - 1) < 0.2  # 1000 count/deg
+    assert said["noise"]["noise_random_walk"]["value"] is None
+    assert said["noise"]["noise_random_walk"]["bound"] > 0
+    figure = (bench / "noise" / "allan.svg").read_text(encoding="utf-8")
+    for part in ("Allan deviation", "averaging time", "white N", "fitted model"):
+        assert part in figure, part
+    assert json.loads(run("allan", bench / "rest.csv", "-o", bench / "noise", "--json").out) == said
+
+
+def test_allan_refuses_what_has_no_noise(tmp_path: Path, run: Run):
+    (tmp_path / "campaign.csv").write_text(CAMPAIGN, encoding="utf-8")
+    assert "at least 64" in refusal(run("allan", tmp_path / "campaign.csv", "-o", tmp_path / "out"))
+    axes = CAMPAIGN.replace("output [count/s]", "output_x [count/s]")
+    (tmp_path / "campaign.csv").write_text(axes, encoding="utf-8")
+    assert "axis" in refusal(run("allan", tmp_path / "campaign.csv", "-o", tmp_path / "out"))
+    assert "nothing.csv" in refusal(run("allan", tmp_path / "nothing.csv", "-o", tmp_path / "out"))
 
 
 @pytest.fixture(scope="module")

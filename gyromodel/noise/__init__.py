@@ -1,4 +1,4 @@
-"""Noise as part of the model: white, flicker and random walk as state-space blocks, and their restricted likelihood."""
+"""Noise: part of a model (white, flicker, random walk), deviations over averaging time, kinds and sizes in a record."""
 
 from gyromodel.noise._deviation import Deviation, Estimator, deviation
 from gyromodel.noise._identify import IdentifiedNoise, Line, NoiseTerm, identify_noise, with_gaps
@@ -10,12 +10,17 @@ __all__ = [
     "CellFit",
     "Deviation",
     "Estimator",
+    "IdentifiedNoise",
+    "Line",
     "NoiseGrid",
     "NoiseRatios",
+    "NoiseTerm",
     "coefficients",
     "deviation",
     "from_grams",
+    "identify_noise",
     "markov_sum",
     "noise_grid",
     "restricted_likelihood",
+    "with_gaps",
 ]

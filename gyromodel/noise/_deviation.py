@@ -1,8 +1,8 @@
 """Allan, modified Allan, Hadamard and total deviation of a rate record with any gaps, with chi-squared intervals.
 
-Sources: W. J. Riley, Handbook of Frequency Stability Analysis, NIST Special Publication 1065 (2008), for the estimators;
-C. A. Greenhall and W. J. Riley, Uncertainty of Stability Variances Based on Finite Differences, 35th PTTI (2003), for
-the degrees of freedom.
+Sources: W. J. Riley, Handbook of Frequency Stability Analysis, NIST Special Publication 1065 (2008), for the
+estimators; C. A. Greenhall and W. J. Riley, Uncertainty of Stability Variances Based on Finite Differences, 35th PTTI
+(2003), for the degrees of freedom.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _THREADS = 2
 _EXPONENTS = np.array([2, 0, -1, -2])
 # Slopes of the variance that separate them; the modified variance falls faster under quantisation.
 _SLOPES = {False: (-1.5, -0.5, 0.5), True: (-2.0, -0.5, 0.5)}
-# Degrees of freedom of the total variance, b·T/τ − c: NIST SP 1065 table 7, quantisation as white noise.
+# Degrees of freedom of the total variance, b·T/τ − c: NIST SP 1065, section 5.4; quantisation as white noise.
 _TOTAL = {2: (1.5, 0.0), 0: (1.5, 0.0), -1: (1.17, 0.22), -2: (0.93, 0.36)}
 # The degrees of freedom depend on the lengths by their ratio; this fine a grid, this many lengths of lag are enough.
 _GRID, _REACH = 16, 16
@@ -76,7 +76,7 @@ def deviation(
     Returns:
         The deviation at each averaging length.
 
-    Source: NIST SP 1065 equations 9, 16, 19 and 25.
+    Source: NIST SP 1065, section 5.2; equation 25 for the total deviation.
     """
     rate = np.asarray(rate, np.float64)
     if lengths is None:
@@ -201,7 +201,9 @@ def _dominant(variance: np.ndarray, lengths: np.ndarray, estimator: Estimator) -
     if len(lengths) < 2:
         return np.zeros(len(lengths), int)
     slope = np.gradient(np.log(np.maximum(variance, 1e-300)), np.log(lengths))
-    return _EXPONENTS[np.searchsorted(_SLOPES[estimator == "modified"], slope)]
+    exponent = _EXPONENTS[np.searchsorted(_SLOPES[estimator == "modified"], slope)]
+    # Quantisation falls fastest: behind any other noise it cannot lead again.
+    return np.where(np.logical_and.accumulate(exponent == 2), 2, np.minimum(exponent, 0))
 
 
 @lru_cache

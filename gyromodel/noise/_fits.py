@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from gyromodel.numerics.maximise import maximise
 # Parameters of a mixture: logarithms of N² and Q² as variances of a sample, B², K², q², and of the time constant.
 WHITE, QUANTISATION, FLICKER, WALK, MARKOV, TIME_CONSTANT = range(6)
 # Twice the log likelihood ratio that makes a kind found. A variance at its bound of zero exceeds it in half of the
-# cases that chi-squared with one degree of freedom would, 0.5 %; a Markov process has a time constant to choose as well.
+# cases that chi-squared with one degree of freedom would, 0.5 %; a Markov process has a time constant to choose too.
 THRESHOLD, MARKOV_THRESHOLD = 6.63, 14.0
 # Markov terms of flicker per decade of time constants.
 TERMS_PER_DECADE = 1.3
@@ -22,12 +23,27 @@ SHORTEST = 2.0
 # What is this much below the level where the record begins to show it is out of sight.
 OUT_OF_SIGHT = 12.0
 
+# Steps of a search for the end of an interval, how close to its level it ends, and the logarithm that counts as zero.
+SEARCH_STEPS, CLOSE, FAR = 14, 0.03, 25.0
+
 # Which of white noise, quantisation, flicker, random walk and Markov noise a model holds.
 Model = tuple[bool, ...]
 
 
+class Search(NamedTuple):
+    """An end of an interval: of which parameter of which model, how far below the top, and on which side.
+
+    `reach` is the square root of twice the fall of the log likelihood.
+    """
+
+    model: Model
+    parameter: int
+    reach: float
+    up: bool
+
+
 class Fits:
-    """Mixtures of kinds fitted to one reduced record; parameters are logarithms of variances, and of the time constant."""
+    """Mixtures of kinds fitted to one reduced record; parameters are logarithms: variances, and the time constant."""
 
     def __init__(self, record: Reduced, interval: float, span: float, start: np.ndarray) -> None:
         self.record, self.interval, self.span, self.start = record, interval, span, start
@@ -85,40 +101,32 @@ class Fits:
         """The model of greatest penalised likelihood, of those with some property."""
         return max((m for m in self.found if within(m)), key=self.penalised)
 
-    def ends(self, model: Model, which: Sequence[int], reach: float, up: Sequence[bool]) -> np.ndarray:
-        """Where the profile likelihood of each parameter, upwards or downwards, has fallen by reach²/2; −inf for zero."""
-        point, top = self.found[model]
-        free = np.tile([*model, model[MARKOV]], (len(which), 1))
-        index = np.arange(len(which))
-        free[index, list(which)] = False
-        origin, sign = point[list(which)], np.where(up, 1.0, -1.0)
-        far = origin.copy()
+    def ends(self, searches: Sequence[Search]) -> np.ndarray:
+        """Where profile likelihoods have fallen far enough, side by side; −inf for a variance of zero."""
+        index, which = np.arange(len(searches)), [s.parameter for s in searches]
+        tops = np.array([self.found[s.model][1] for s in searches])
+        places = np.array([self.found[s.model][0] for s in searches])
+        free = np.array([[*s.model, s.model[MARKOV]] for s in searches])
+        free[index, which] = False
+        sign, reach = np.array([1.0 if s.up else -1.0 for s in searches]), np.array([s.reach for s in searches])
         # A parameter that went out of sight starts from where the record would begin to show it.
-        origin = np.where(origin < self.start[list(which)] - OUT_OF_SIGHT, self.start[list(which)] - OUT_OF_SIGHT, origin)
-        distance, low, high = np.full(len(which), 0.3), np.zeros(len(which)), np.full(len(which), np.inf)
-        settled, places = np.zeros(len(which), bool), np.tile(point, (len(which), 1))
-        for _ in range(14):
-            todo = np.flatnonzero(~settled)
-            starts = places[todo].copy()
-            starts[np.arange(len(todo)), np.asarray(which)[todo]] = (origin + sign * distance)[todo]
-            x, value = maximise(self.log_likelihood, starts, free[todo], self.low, self.high)
-            drop = np.sqrt(2.0 * np.maximum(top - value, 0.0))
-            for k, point_k, d in zip(todo, x, drop, strict=True):
-                places[k] = point_k
-                far[k] = origin[k] + sign[k] * distance[k]
-                settled[k] = abs(d - reach) < 0.03
-                if settled[k]:
+        origin = np.maximum(places[index, which], self.start[which] - OUT_OF_SIGHT)
+        distance, low, high = np.full(len(searches), 0.3), np.zeros(len(searches)), np.full(len(searches), np.inf)
+        end, active = origin.copy(), np.ones(len(searches), bool)
+        for _ in range(SEARCH_STEPS):
+            todo = np.flatnonzero(active)
+            places[index, which] = end = np.where(active, origin + sign * distance, end)
+            places[todo], value = maximise(self.log_likelihood, places[todo], free[todo], self.low, self.high)
+            fallen = np.sqrt(2.0 * np.maximum(tops[todo] - value, 0.0))
+            for k, d in zip(todo, fallen, strict=True):
+                if sign[k] < 0 and d < reach[k] and distance[k] > FAR:
+                    end[k], active[k] = -np.inf, False
                     continue
-                if d < reach:
-                    low[k] = distance[k]
-                else:
-                    high[k] = distance[k]
-                if not up[k] and distance[k] > 25.0 and d < reach:
-                    far[k], settled[k] = -np.inf, True
-                step = distance[k] * np.clip(reach / max(d, 1e-3), 0.1, 3.0)
-                distance[k] = step if low[k] < step < high[k] else 0.5 * (low[k] + high[k])
-                if not np.isfinite(distance[k]):
-                    distance[k] = 3.0 * low[k]
-            if settled.all():
+                active[k] = abs(d - reach[k]) > CLOSE
+                low[k], high[k] = (distance[k], high[k]) if d < reach[k] else (low[k], distance[k])
+                step = distance[k] * np.clip(reach[k] / max(d, 1e-3), 0.1, 3.0)
+                middle = 0.5 * (low[k] + high[k]) if np.isfinite(high[k]) else 3.0 * low[k]
+                distance[k] = step if low[k] < step < high[k] else middle
+            if not active.any():
                 break
-        return far
+        return end

@@ -13,10 +13,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import norm
+from scipy.stats import chi2, gamma, norm
 from threadpoolctl import threadpool_limits
 
-from gyromodel.noise._deviation import deviation
+from gyromodel.noise._deviation import Deviation, deviation
 from gyromodel.noise._fits import (
     FLICKER,
     MARKOV,
@@ -26,20 +26,23 @@ from gyromodel.noise._fits import (
     WHITE,
     Fits,
     Model,
+    Search,
 )
 from gyromodel.noise._lines import MOST_LINES, Spectrum, background, find_lines, line_columns, spectrum
 from gyromodel.noise._reduced import MOST_ROWS, Mixture, reduced
 
-Verdict = Literal["found", "ambiguous", "not identifiable"]
+Verdict = Literal["found", "ambiguous", "doubtful", "not identifiable"]
 
 KINDS = ("noise_white", "noise_quantisation", "noise_flicker", "noise_random_walk", "noise_markov")
-# Square root of twice the log likelihood ratio at the ends of a 95 % interval, and of a 95 % upper bound.
-TWO_SIDED, ONE_SIDED = 1.960, 1.645
+# Square root of twice the log likelihood ratio at the ends of a 95 % interval, and at a 95 % upper bound, which holds
+# even where slow noise shows in a single degree of freedom: χ²₁ < r, with r − 1 − ln r = 2.13², in 5 % of records.
+TWO_SIDED, BOUND = 1.960, 2.13
 # The same for a trend, which a random walk imitates: in 150 records each without a trend, at five sizes of the walk, it
 # exceeded 12 once.
 TREND = 12.0
-# Frequencies per bin of the whitened spectrum; their mean may miss one by this factor, and by chance this seldom.
-FEWEST_IN_BIN, BINS, MISFIT, BY_CHANCE = 24, 40, 1.25, 1e-4
+# Frequencies per bin of the whitened spectrum, and bins. All bins together contradict the model this seldom by chance;
+# those are named that miss it by this factor and this many standard deviations.
+FEWEST_IN_BIN, BINS, BY_CHANCE, MISFIT, APART = 24, 40, 1e-4, 1.25, 2.6
 # Loss of independent frequencies by the Hann window: 1 + 2 (4/9 + 1/36).
 HANN = 35.0 / 18.0
 FIRST_IN_BIN = 4
@@ -50,6 +53,8 @@ GAP = 1.5
 SLOW_LINE = 1e-2
 # Half the 95 % point of chi-squared with one degree of freedom.
 BETTER = 1.92
+# Allan variance times averaging length over its least so far, from which on the noise is redder than white.
+REDDER = 1.5
 # A kind whose absence costs this much needs no search without it.
 CERTAIN = 50.0
 # All kinds but Markov noise; the same but white noise; the same but flicker.
@@ -60,14 +65,17 @@ UNFLICKERING = (True, True, False, True, False)
 class NoiseTerm(NamedTuple):
     """One kind of noise, in units of the rate and s.
 
-    `value` with its 95 % limits where `verdict` is found; where it is ambiguous, the size if it is this kind rather than
-    one of `alternatives`; where it is not identifiable, the record shows no more than the upper limit, at 95 %.
+    `value` with its 95 % limits where `verdict` is found; where it is ambiguous, the size if it is this kind rather
+    than one of `alternatives`; where it is not identifiable, the record shows no more than the upper limit, at 95 %. Of
+    kinds that stand for one another only one is `in_model`. What would be found or ambiguous is doubtful where the
+    spectrum contradicts the model. A Markov process has its time constant (s) beside it.
     """
 
     value: float
     low: float
     high: float
     verdict: Verdict
+    in_model: bool
     alternatives: tuple[str, ...] = ()
     time_constant: float = float("nan")
 
@@ -88,12 +96,15 @@ class IdentifiedNoise(NamedTuple):
     """Terms by public noise id, the trend per second, steady lines, and whether the spectrum bears it all out.
 
     `misfits` lists frequency bands (Hz) whose power is not the model's, with the ratio of measured to fitted power.
+    `approximate` says that the record was too long for the exact likelihood of noise as coloured as this: intervals are
+    then too short.
     """
 
     terms: dict[str, NoiseTerm]
     lines: tuple[Line, ...]
     more_lines: bool
     misfits: tuple[tuple[float, float, float], ...]
+    approximate: bool
 
     @property
     def fits(self) -> bool:
@@ -101,16 +112,24 @@ class IdentifiedNoise(NamedTuple):
         return not self.misfits and not self.more_lines
 
     def allan_variance(self, tau: Float[np.ndarray, " tau"]) -> dict[str, Float[np.ndarray, " tau"]]:
-        """Allan variance of each term that is found or ambiguous, of the trend and of the lines, by averaging time."""
+        """Allan variance of each term of the model, and of the lines together, over averaging time (s).
+
+        Source: IEEE Std 952-1997, annex C.
+        """
         formulas = {
             "noise_white": lambda t: t.value**2 / tau,
             "noise_quantisation": lambda t: 3.0 * t.value**2 / tau**2,
             "noise_flicker": lambda t: 2.0 * np.log(2.0) / np.pi * t.value**2 + 0.0 * tau,
             "noise_random_walk": lambda t: t.value**2 * tau / 3.0,
-            "noise_rate_ramp": lambda t: t.value**2 * tau**2 / 2.0,
             "noise_markov": lambda t: _markov_variance(t.value, t.time_constant, tau),
+            "noise_rate_ramp": lambda t: t.value**2 * tau**2 / 2.0,
         }
-        return {k: formulas[k](t) for k, t in self.terms.items() if t.verdict != "not identifiable"}
+        shares = {key: formula(self.terms[key]) for key, formula in formulas.items() if self.terms[key].in_model}
+        for line in self.lines:
+            cycles = np.pi * line.frequency * tau
+            share = (line.amplitude * np.sin(cycles) ** 2 / cycles) ** 2
+            shares["lines"] = shares.get("lines", 0.0) + share
+        return shares
 
 
 def _markov_variance(q: float, constant: float, tau: np.ndarray) -> np.ndarray:
@@ -166,12 +185,13 @@ def _identify(rate, time, restart, present, tell) -> IdentifiedNoise:
     y = y - waves @ sizes
     if present.sum() > MOST_ROWS:  # means of groups hold nothing of fast lines
         waves = waves[:, np.repeat(frequencies < SLOW_LINE / interval, 2)]
-    start = _start(with_gaps(y, time, restart, interval), interval)
+    seen = deviation(with_gaps(y, time, restart, interval), interval)
+    start, longest = _start(seen), _white_until(seen)
     tell("trend", 0.1)
     trend = (time - time[present].mean()) / span
     columns = np.column_stack([bias, waves])
     level, tilted = (
-        Fits(reduced(time, y, x, restart, interval), interval, span, start)
+        Fits(reduced(time, y, x, restart, interval, longest), interval, span, start)
         for x in (columns, np.column_stack([columns, trend]))
     )
     ramp, slope = _ramp(level, tilted)
@@ -183,13 +203,21 @@ def _identify(rate, time, restart, present, tell) -> IdentifiedNoise:
     units = (interval**0.5, interval, 1.0, 1.0, 1.0)
     terms = {KINDS[k]: t.scaled(scale * units[k]) for k, t in _terms(fits, chosen).items()}
     terms["noise_rate_ramp"] = ramp.scaled(scale / span)
-    seen = spectrum(y[clean], interval)
-    errors = np.sqrt(2.0 * np.interp(frequencies, seen.frequency, background(seen.power)) / span) * scale
+    power = spectrum(y[clean], interval)
+    errors = np.sqrt(2.0 * np.interp(frequencies, power.frequency, background(power.power)) / span) * scale
     lines = zip(frequencies, np.hypot(*sizes.reshape(-1, 2).T) * scale, errors, strict=True)
-    misfits = _misfits(fits.mixture(fits.found[chosen][0][None]), seen, interval)
+    misfits = _misfits(fits.mixture(fits.found[chosen][0][None]), power, interval)
+    if misfits or more:
+        terms |= {
+            k: t._replace(verdict="doubtful")
+            for k, t in terms.items()
+            if k in KINDS and t.verdict != "not identifiable"
+        }
     tell("identified", 1.0)
     order = (*KINDS, "noise_rate_ramp")
-    return IdentifiedNoise({k: terms[k] for k in order}, tuple(Line(*map(float, x)) for x in lines), more, misfits)
+    return IdentifiedNoise(
+        {k: terms[k] for k in order}, tuple(Line(*map(float, x)) for x in lines), more, misfits, fits.record.approximate
+    )
 
 
 def _longest(good: np.ndarray) -> slice:
@@ -210,9 +238,15 @@ def with_gaps(rate: np.ndarray, time: np.ndarray, restart: np.ndarray, interval:
     return np.insert(rate, np.flatnonzero(~_regular(time, restart, interval))[1:], np.nan)
 
 
-def _start(rate: np.ndarray, interval: float) -> np.ndarray:
+def _white_until(seen: Deviation) -> int:
+    """The averaging length up to which the noise is no redder than white."""
+    level = seen.deviation**2 * seen.length
+    redder = level > REDDER * np.minimum.accumulate(level)
+    return int(seen.length[np.argmax(redder)]) // 2 if redder.any() else int(seen.length[-1])
+
+
+def _start(seen: Deviation) -> np.ndarray:
     """Parameters at which each kind by itself would reach half of the Allan variance where it comes nearest to it."""
-    seen = deviation(rate, interval)
     variance, m = seen.deviation**2, seen.length
     largest = [variance * m, variance * m**2 / 3.0, variance * np.pi / (2.0 * np.log(2.0)), 3.0 * variance / seen.tau]
     return np.log(0.5 * np.array([*(x.min() for x in largest), largest[3].min(), 1.0]))
@@ -230,8 +264,8 @@ def _ramp(level: Fits, tilted: Fits) -> tuple[NoiseTerm, float]:
     value, covariance = tilted.record.regression(tilted.mixture(tilted.found[UNFLICKERING][0][None]))
     size, margin = abs(float(value[-1])), TWO_SIDED * float(np.sqrt(covariance[-1, -1]))
     if gain > TREND:
-        return NoiseTerm(size, size - margin, size + margin, "found"), float(value[-1])
-    return NoiseTerm(size, 0.0, size + margin, "not identifiable"), 0.0
+        return NoiseTerm(size, size - margin, size + margin, "found", True), float(value[-1])
+    return NoiseTerm(size, 0.0, size + margin, "not identifiable", False), 0.0
 
 
 def _choose(fits: Fits) -> Model:
@@ -297,28 +331,29 @@ def _terms(fits: Fits, chosen: Model) -> dict[int, NoiseTerm]:
             alternatives[k] = tuple(KINDS[j] for j in range(5) if peer and chosen[j] and not peer[j])
     union = tuple(verdict[k] != "not identifiable" for k in range(len(KINDS)))
     fits.fit([union], [_joined(fits, chosen, peers, union)])
-    shown = [k for k in range(len(KINDS)) if union[k]]
-    low = dict(zip(shown, fits.ends(union, shown, TWO_SIDED, [False] * len(shown)), strict=True))
-    high = dict(zip(shown, fits.ends(union, shown, TWO_SIDED, [True] * len(shown)), strict=True))
+    wider: dict[int, Model] = {k: tuple(u or i == k for i, u in enumerate(union)) for k in range(MARKOV)}
+    added = [m for k, m in wider.items() if not union[k]]
+    x = fits.found[union][0]
+    fits.fit(added, [np.where(np.isfinite(x), x, fits.start - 2.0)] * len(added))
+    searches = [Search(union, k, TWO_SIDED, up) for k in range(len(KINDS)) if union[k] for up in (False, True)]
+    searches += [Search(m, k, BOUND, True) for k, m in wider.items() if not union[k]]
+    ends = dict(zip([(s.parameter, s.up) for s in searches], fits.ends(searches), strict=True))
     out: dict[int, NoiseTerm] = {}
     for k in range(len(KINDS)):
-        model = chosen if chosen[k] else peers.get(k, chosen)
-        point = fits.found[model][0]
-        if k == MARKOV and not union[k]:
-            # Without a time constant there is no bound: white noise and random walk are its limits.
-            out[k] = NoiseTerm(0.0, 0.0, float("inf"), "not identifiable")
+        if (k, True) not in ends:
+            # Without a time constant a Markov process has no bound: white noise and random walk are its limits.
+            out[k] = NoiseTerm(0.0, 0.0, float("inf"), "not identifiable", False)
             continue
-        if not union[k]:
-            wider = tuple(u or i == k for i, u in enumerate(union))
-            fits.fit([wider], [np.where(np.isfinite(fits.found[union][0]), fits.found[union][0], fits.start - 2.0)])
-            low[k], high[k] = -np.inf, fits.ends(wider, [k], ONE_SIDED, [True])[0]
-            point = fits.found[wider][0]
-        value, floor, ceiling = np.exp(0.5 * np.array([point[k], low[k], high[k]]))
-        constant = float(np.exp(point[TIME_CONSTANT])) if k == MARKOV else float("nan")
-        if verdict[k] == "found" and floor == 0.0:
+        model = chosen if chosen[k] else peers[k] if union[k] else wider[k]
+        point = fits.found[model][0]
+        logs = np.array([point[k], ends.get((k, False), -np.inf), ends[k, True]])
+        value, low, high = (float(v) for v in np.exp(0.5 * logs))
+        low, high = min(low, value), max(high, value)  # they may come from different models
+        if verdict[k] == "found" and low == 0.0:
             verdict[k] = "ambiguous"
         said = alternatives[k] if verdict[k] == "ambiguous" else ()
-        out[k] = NoiseTerm(float(value), float(floor), float(ceiling), verdict[k], said, constant)
+        constant = float(np.exp(point[TIME_CONSTANT])) if k == MARKOV else float("nan")
+        out[k] = NoiseTerm(value, low, high, verdict[k], chosen[k], said, constant)
     return out
 
 
@@ -344,13 +379,19 @@ def _misfits(noise: Mixture, seen: Spectrum, interval: float) -> tuple[tuple[flo
     frequency = seen.frequency[FIRST_IN_BIN:]
     if len(ratio) < 2 * FEWEST_IN_BIN:
         return ()
-    edges = np.unique(np.geomspace(FEWEST_IN_BIN, len(ratio), BINS).astype(int))
-    edges = np.concatenate([[0], edges[np.diff(edges, prepend=-FEWEST_IN_BIN) >= FEWEST_IN_BIN]])
-    edges[-1] = len(ratio)
+    edges = [0]
+    for edge in np.geomspace(FEWEST_IN_BIN, len(ratio), BINS).astype(int):
+        if edge - edges[-1] >= FEWEST_IN_BIN:
+            edges.append(int(edge))
+    edges = np.array([*edges[:-1], len(ratio)])
     count = np.diff(edges)
     mean = np.add.reduceat(ratio, edges[:-1]) / count
-    error = np.sqrt(HANN / count)
-    chance = 2.0 * norm.sf(np.abs(mean - 1.0) / error) * len(count)
-    bad = (chance < BY_CHANCE) & (np.abs(np.log(np.maximum(mean, 1e-300))) > np.log(MISFIT))
+    # Means of periodograms are gamma variables; as normal ones their squares add up to chi-squared.
+    shape = count / HANN
+    score = np.abs(norm.ppf(np.clip(gamma.cdf(mean * shape, shape), 1e-15, 1.0 - 1e-15)))
+    contradicted = chi2.sf(np.sum(score**2), len(score)) < BY_CHANCE
+    bad = contradicted & (score > APART) & (np.abs(np.log(np.maximum(mean, 1e-300))) > np.log(MISFIT))
     last = np.append(frequency, frequency[-1])[edges[1:] - 1]
-    return tuple((float(a), float(b), float(r)) for a, b, r in zip(frequency[edges[:-1]][bad], last[bad], mean[bad], strict=True))
+    return tuple(
+        (float(a), float(b), float(r)) for a, b, r in zip(frequency[edges[:-1]][bad], last[bad], mean[bad], strict=True)
+    )

@@ -17,7 +17,9 @@ import numpy as np
 from gyromodel.numerics.markov_cells import MarkovCells, Rows, log_determinant_and_gram
 
 # Rows that go through the filter as they are; sizes of groups where there are more.
-MOST_ROWS, SMALLEST_GROUP, LARGEST_GROUP = 4096, 16, 128
+MOST_ROWS, SMALLEST_GROUP, LARGEST_GROUP = 2048, 16, 64
+# More rows than this are grouped even where their noise is coloured.
+TOO_MANY = 16_384
 # Groups are whole; where gaps leave fewer rows in them than this share, the filter takes every row.
 WHOLE = 0.8
 # Cells filtered together.
@@ -70,8 +72,10 @@ class Level(NamedTuple):
         lag = np.abs(np.subtract.outer(np.arange(rows), np.arange(rows)))
         total = self.contrasts @ noise.covariance(rows).T[:, lag] @ self.contrasts.T
         sign, log_determinant = np.linalg.slogdet(total)
+        good = (sign > 0) & np.isfinite(log_determinant)
+        total = np.where(good[:, None, None], total, np.eye(rows - 1))
         misfit = np.trace(np.linalg.solve(total, self.moments), axis1=1, axis2=2)
-        good = (sign > 0) & (misfit > 0)
+        good &= misfit > 0
         return np.where(good, -0.5 * (self.groups * log_determinant + misfit), -np.inf)
 
 
@@ -82,10 +86,11 @@ class Reduced(NamedTuple):
     rows: Rows
     columns: np.ndarray
     interval: float
+    approximate: bool
     restricted: bool = True
 
     def log_likelihood(self, noise: Mixture) -> np.ndarray:
-        """ln likelihood of each noise, to a constant; restricted to what the regressors leave, or at its maximum over them."""
+        """ln likelihood of each noise, to a constant; restricted, or at its maximum over the regressors."""
         total = np.zeros(len(noise.white))
         for level in self.levels:
             total += level.log_likelihood(noise)
@@ -129,11 +134,17 @@ class Reduced(NamedTuple):
 def _solved(gram: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """ln |XᵀV⁻¹X| and the residual sum of squares, the data being the last column."""
     a, b, c = gram[:, :-1, :-1], gram[:, :-1, -1], gram[:, -1, -1]
-    with np.errstate(all="ignore"):
-        return np.linalg.slogdet(a)[1], c - np.einsum("gi,gi->g", b, np.linalg.solve(a, b[..., None])[..., 0])
+    with np.errstate(invalid="ignore"):  # what is no covariance comes out as no number
+        sign, log_x = np.linalg.slogdet(a)
+    good = (sign > 0) & np.isfinite(log_x)
+    a = np.where(good[:, None, None], a, np.eye(a.shape[1]))
+    rss = c - np.einsum("gi,gi->g", b, np.linalg.solve(a, b[..., None])[..., 0])
+    return np.where(good, log_x, np.inf), rss
 
 
-def reduced(time: np.ndarray, rate: np.ndarray, columns: np.ndarray, restart: np.ndarray, interval: float) -> Reduced:
+def reduced(
+    time: np.ndarray, rate: np.ndarray, columns: np.ndarray, restart: np.ndarray, interval: float, longest: int
+) -> Reduced:
     """Group a record until few enough rows are left.
 
     Args:
@@ -142,6 +153,8 @@ def reduced(time: np.ndarray, rate: np.ndarray, columns: np.ndarray, restart: np
         columns: regressors, which are fitted by least squares before deviations within groups are taken.
         restart: where independent records begin.
         interval: nominal time between samples (s).
+        longest: samples that a group may span: up to here the noise is no redder than white, and groups do not tell of
+            one another. Records over TOO_MANY rows are grouped all the same, which is then an approximation.
     """
     present = np.isfinite(rate)
     data = np.column_stack([columns, np.where(present, rate, 0.0)])
@@ -149,8 +162,12 @@ def reduced(time: np.ndarray, rate: np.ndarray, columns: np.ndarray, restart: np
     step = np.diff(time, prepend=time[0] - interval)
     follows = ~restart & (step < 1.5 * interval) & np.concatenate([[False], present[:-1]]) & present
     levels: list[Level] = []
+    approximate = False
     while (many := int(present.sum())) > MOST_ROWS:
+        if longest < SMALLEST_GROUP and many <= TOO_MANY:
+            break
         size = min(max(2 ** int(np.ceil(np.log2(many / MOST_ROWS))), SMALLEST_GROUP), LARGEST_GROUP)
+        size = max(min(size, 2 ** int(np.log2(max(longest, 1)))), SMALLEST_GROUP)
         stretch = np.cumsum(~follows)[present]
         order = np.arange(many) - np.searchsorted(stretch, stretch)
         first = np.flatnonzero(order % size == 0)
@@ -168,11 +185,10 @@ def reduced(time: np.ndarray, rate: np.ndarray, columns: np.ndarray, restart: np
         data, time = groups.mean(1), time[index[:, 0]]
         restart = np.logical_or.reduceat(restart, np.concatenate([[0], index[1:, 0]]))
         follows = np.concatenate([[False], (index[1:, 0] == index[:-1, -1] + 1) & follows[index[1:, 0]]])
-        interval, present = interval * size, np.ones(len(first), bool)
-    rows = Rows(
-        *(jnp.asarray(v) for v in (np.diff(time, prepend=time[0]), restart, follows, present))
-    )
-    return Reduced(tuple(levels), rows, data, interval)
+        approximate |= size > longest
+        interval, longest, present = interval * size, longest // size, np.ones(len(first), bool)
+    rows = Rows(*(jnp.asarray(v) for v in (np.diff(time, prepend=time[0]), restart, follows, present)))
+    return Reduced(tuple(levels), rows, data, interval, approximate)
 
 
 def _contrasts(size: int) -> np.ndarray:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 
@@ -19,17 +20,16 @@ class MarkovCells(NamedTuple):
     `white` may be negative as long as the whole is a covariance: averages of Markov processes are of that form.
     """
 
-    white: Float[Array, " cell"]
-    differenced: Float[Array, " cell"]
-    decay: Float[Array, "state cell"]
-    variance: Float[Array, "state cell"]
+    white: Float[Array | np.ndarray, " cell"]
+    differenced: Float[Array | np.ndarray, " cell"]
+    decay: Float[Array | np.ndarray, "state cell"]
+    variance: Float[Array | np.ndarray, "state cell"]
 
 
 class Rows(NamedTuple):
     """When samples were taken: time since the one before (s), whether it opens a record, follows on, is there.
 
-    `follows` says that the sample shares an end with the one before, so that their rounding errors are linked; `fewer`
-    multiplies the plain white variance, where a row averages fewer samples than others do.
+    `follows` says that the sample begins where the one before ends, so that their rounding errors are linked.
     """
 
     interval: Float[Array, " row"]
@@ -40,7 +40,7 @@ class Rows(NamedTuple):
 
 @jax.jit
 def log_determinant_and_gram(
-    noise: MarkovCells, rows: Rows, columns: Float[Array, "row column"]
+    noise: MarkovCells, rows: Rows, columns: Float[Array | np.ndarray, "row column"]
 ) -> tuple[Float[Array, " cell"], Float[Array, "column column cell"]]:
     """ln |V| and XᵀV⁻¹X of columns X under each noise, over the rows present."""
     states, cells = noise.decay.shape

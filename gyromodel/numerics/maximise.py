@@ -10,6 +10,8 @@ import numpy as np
 # Step of finite differences, longest Newton step of a parameter, and gain that is no longer worth a step.
 STEP, LONGEST, WORTH = 0.02, 2.0, 1e-3
 ITERATIONS = 40
+# Where the function is undefined it counts as this much lower.
+UNDEFINED = 1e6
 # Least curvature in any direction: below it a parameter is out of sight, and steps are long.
 FLAT = 1e-2
 
@@ -40,13 +42,15 @@ def maximise(
             if not v[0] > value[k]:  # too far: come back
                 move[k] *= 0.25
                 active[k] = np.abs(move[k]).max(initial=0.0) > 1e-6
-                trial[k] = best[k] + move[k]
+                trial[k] = np.where(free[k], np.clip(best[k] + move[k], low, high), best[k])
                 continue
             best[k], value[k] = trial[k], v[0]
             index = np.flatnonzero(free[k])
             gradient, curvature = _derivatives(v, len(index))
             # A parameter that pushes against its bound stays there.
-            inside = ~((best[k, index] <= low[index]) & (gradient < 0) | (best[k, index] >= high[index]) & (gradient > 0))
+            inside = ~(
+                (best[k, index] <= low[index]) & (gradient < 0) | (best[k, index] >= high[index]) & (gradient > 0)
+            )
             gradient, curvature = gradient[inside], curvature[np.ix_(inside, inside)]
             size, axes = np.linalg.eigh(curvature) if inside.any() else (np.zeros(0), np.zeros((0, 0)))
             step = axes @ ((axes.T @ gradient) / np.maximum(np.abs(size), FLAT))
@@ -72,6 +76,7 @@ def _stencil(x: np.ndarray, free: np.ndarray) -> np.ndarray:
 
 def _derivatives(v: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Gradient and negative Hessian from the values on a stencil."""
+    v = np.maximum(v, v[0] - UNDEFINED)
     up, down, pairs = v[1 : 1 + 2 * count : 2], v[2 : 1 + 2 * count : 2], v[1 + 2 * count :]
     curvature = np.diag((2 * v[0] - up - down) / STEP**2)
     for value, (a, b) in zip(pairs, combinations(range(count), 2), strict=True):
