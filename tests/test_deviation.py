@@ -4,6 +4,11 @@ are missing, and against published values: the ten- and the thousand-point sets 
 
 from __future__ import annotations
 
+import gzip
+import json
+from collections.abc import Callable
+from pathlib import Path
+
 import allantools
 import numpy as np
 import pytest
@@ -181,3 +186,18 @@ def test_dominant_noise_is_read_off_the_slope(rng: np.random.Generator):
 def test_too_short_or_empty_records_have_no_terms():
     assert len(deviation(np.full(50, np.nan), 1.0).tau) == 0
     assert len(deviation(np.array([1.0]), 1.0).tau) == 0
+
+
+def test_intervals_are_no_wider_than_those_published_for_real_sensors(
+    measured_data: Callable[[str], Path], rng: np.random.Generator
+):
+    """Published: two standard errors of terms that do not overlap; overlapping terms cannot know less."""
+    published = json.loads(gzip.decompress(measured_data("av_published.json.gz").read_bytes()))["adis"]
+    curve = {name: np.array(values) for name, values in published["avar"]["Gyro. X"].items()}
+    lengths = np.rint(curve["tau"] * published["freq"]).astype(int)
+    theirs = (curve["uci"] - curve["lci"]) / (2 * curve["adev"])
+    assert theirs == pytest.approx(2 / np.sqrt(2 * (published["n"] / lengths - 1)), rel=1e-3)
+    ours = deviation(rng.normal(size=published["n"]), 1 / published["freq"], lengths=lengths[:12])
+    ratio = (ours.high - ours.low) / (2 * ours.deviation) / theirs[:12]
+    assert ratio.max() < 1.0
+    assert ratio.min() > 0.7
