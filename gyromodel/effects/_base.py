@@ -177,4 +177,5 @@ def stack(*columns: Float[Array, " sample"]) -> Float[Array, "sample coefficient
 
 def round_reference(values: Float[Array, " sample"], step: float = 1.0) -> Float[Array, ""]:
     """Mean rounded to a readable reference point."""
-    return jnp.asarray(np.round(float(np.nanmean(np.asarray(values))) / step) * step)
+    known = np.asarray(values)[np.isfinite(values)]
+    return jnp.asarray(np.round(known.mean() / step) * step if len(known) else np.nan)

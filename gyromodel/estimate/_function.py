@@ -35,6 +35,8 @@ MAXIMUM_ITERATIONS = 500
 UNSCALED_ITERATIONS = 10_000
 # Rounds of fit and scatter of groups, of the scatter in one linearised fit, and the relative change that ends both.
 SCALE_ROUNDS, LINEAR_ROUNDS, SCALE_CLOSE = 20, 500, 1e-6
+# Least scatter of a group, as a part of what the errors of the given values do to its observations.
+HIDDEN = 1e-3
 # A minimum whose sum of squares is this improbable, the errors being known, is a false one until other starts agree.
 IMPROBABLE = 1e-6
 
@@ -278,6 +280,10 @@ def _scatter(problem: _Problem, x: np.ndarray, sizes: np.ndarray, scatter: np.nd
     residual, jacobian = problem.linearise(x, np.ones(len(sizes)))
     # Data without any scatter are held to their last digit, and not divided by zero.
     least = np.finfo(float).eps * max(float(np.abs(problem.measured / sizes).max()), 1e-100)
+    # Beside the errors of what was given a scatter can vanish by chance; far below them its size no longer matters.
+    moved = np.sum(jacobian[: len(sizes), problem.width :] ** 2, axis=1) / sizes**2
+    counts = np.bincount(problem.groups)
+    least = np.maximum(least, HIDDEN * np.sqrt(np.bincount(problem.groups, moved) / counts))
     for _ in range(LINEAR_ROUNDS):
         weight = np.ones(len(residual))
         weight[: len(sizes)] = 1.0 / (sizes * scatter[problem.groups])
