@@ -52,7 +52,7 @@ def noise_rows(analysis: NoiseAnalysis) -> list[tuple[str, ...]]:
             verdict += f", time constant {term.time_constant:.3g} s"
         rows.append((_NAMES[key], SYMBOLS[key], value, low, high, unit, verdict))
     for line in analysis.noise.lines:
-        limits = (line.amplitude + side * 1.96 * line.std for side in (-1.0, 1.0))
+        limits = (max(line.amplitude + side * 1.96 * line.std, 0.0) for side in (-1.0, 1.0))
         value, low, high = (f"{x * analysis.scale:.3g}" for x in (line.amplitude, *limits))
         rows.append((f"line at {line.frequency:.6g} Hz", "", value, low, high, unit_text(analysis.unit), "found"))
     return rows
@@ -71,7 +71,7 @@ def _drawn(analysis: NoiseAnalysis) -> str:
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.fill_between(seen.tau, seen.low * scale, seen.high * scale, color=draw.BEFORE_DOT, alpha=0.45, linewidth=0)
-    dots = {"linestyle": "none", "marker": "o", "markersize": 3.6, "color": draw.INK}
+    dots = {"linestyle": "none", "marker": "o", "markersize": 3.6, "color": draw.INK, "zorder": 6}
     axes.plot(seen.tau, seen.deviation * scale, label="measured, 95 % band", **dots)
     low = 0.4 * float(seen.deviation.min()) * scale
     high = 1.5 * float(seen.deviation.max()) * scale
