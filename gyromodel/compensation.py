@@ -5,6 +5,7 @@ The model predicts the output from the rate; here the equation is solved for the
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -18,7 +19,7 @@ from gyromodel.campaign import Campaign
 from gyromodel.effects import Signals
 from gyromodel.estimate import Calibration, check_covariates
 from gyromodel.model import GyroModel, check_units
-from gyromodel.model_files import VALIDITY_UNITS
+from gyromodel.model_files import validity_unit
 from gyromodel.signals import Record, read_signals
 from gyromodel.units import from_internal
 
@@ -54,9 +55,11 @@ def compensate(campaign: Campaign, calibration: Calibration) -> Campaign:
         CampaignError: the campaign has several axes.
         ModelError: the model needs a column that the campaign lacks, or is of other units.
     """
-    model = calibration.model
     record = read_signals(campaign)
     record = record._replace(signals=record.signals | {"rate": jnp.zeros_like(record.signals["time"])})
+    # What the calibration leaves open, such as which thermometers, is the campaign's; what it states stays.
+    model = calibration.model.prepared(record.signals)
+    calibration = replace(calibration, model=model)
     check_covariates(record, model)
     check_units(model, record.output_unit, record.units)
     rate, variance = _estimate(calibration, record)
@@ -101,7 +104,7 @@ def _notes(
             "their output at no rate."
         )
     for name, (low, high) in calibration.validity.items():
-        unit = VALIDITY_UNITS[name]
+        unit = validity_unit(name)
         limits = f"{from_internal(low, unit):.6g} to {from_internal(high, unit):.6g} {unit}"
         if name != "rate" and name not in campaign.columns:
             notes.append(f"There is no column {name} to hold against the calibrated range of {limits}.")

@@ -182,12 +182,15 @@ class _Run:
         temperature, unsteady = np.nan, ""
         if "temperature" in record.signals:
             values = np.asarray(record.signals["temperature"])[: record.rows]
-            temperature = float(np.nanmean(values))
-            moved = float(np.ptp([np.nanmean(part) for part in np.array_split(values, 10)]))
+            temperature = float(np.nanmean(values)) if np.isfinite(values).any() else np.nan
+            tenths = [part[np.isfinite(part)] for part in np.array_split(values, 10)]
+            moved = float(np.ptp([part.mean() for part in tenths if len(part)] or [0.0]))
             if moved > STEADY:
                 unsteady = f"the temperature moved by {moved:.1f} °C during the run; hold it within {STEADY:g} °C"
-        step = np.diff(np.asarray(record.signals["time"])[: record.rows])
-        missing = int((~record.present).sum() + (step > 1.5 * record.interval).sum())
+        # The first row of angles has no rate: only what is missing between the first and the last one is a gap.
+        ends = np.flatnonzero(record.present)[[0, -1]]
+        step = np.diff(np.asarray(record.signals["time"])[ends[0] : ends[1] + 1])
+        missing = int((~record.present[ends[0] : ends[1]]).sum() + (step > 1.5 * record.interval).sum())
         gap = f"the run has {missing} gaps or missing samples; use a stretch without" if missing else ""
         return cls(name, rate, record.interval, record, estimate, float(plain.std[0]), temperature, unsteady, gap)
 
@@ -206,14 +209,7 @@ class _Run:
         gls = float(self.estimate.model.vector()[0])
         low, high = self.estimate.noise_interval["noise_white"]
         white, white_std = float(self.estimate.model.noise["noise_white"]), (high - low) / 3.92
-        allan = deviation(self.rate, self.interval)
-        at = int(np.argmin(allan.deviation))
-        floor = float(allan.deviation[at]) / FLICKER_FLOOR
-        # The local slope, on which those degrees of freedom rest, is poor at the end: at most one an averaging time.
-        freedom = min(allan.degrees_of_freedom[at], len(self.rate) * self.interval / allan.tau[at])
-        floor_std = floor / float(np.sqrt(2.0 * freedom))
-        reached = at < len(allan.tau) - 2
-        floor_name = f"Allan floor at {allan.tau[at]:.3g} s / 0.664" + ("" if reached else ", not reached: upper limit")
+        floor, floor_std, floor_name = self._floor()
         walk = angle_random_walk(rate, bandwidth or 1.0 / self.interval)
         coefficient, coefficient_std, reason = _random_walk(lengths * self.interval, squares, drawn)
         return [
@@ -226,6 +222,19 @@ class _Run:
             ),
             self._figure("RWC", coefficient, coefficient_std, white, white_std, "N by likelihood", self.gap or reason),
         ]
+
+    def _floor(self) -> tuple[float, float, str]:
+        """Bias instability off the lowest Allan deviation, its standard uncertainty, and where it was read."""
+        allan = deviation(self.rate, self.interval)
+        if len(allan.tau) < 3:
+            return np.nan, np.nan, "Allan floor: too few samples between gaps"
+        at = int(np.argmin(allan.deviation))
+        floor = float(allan.deviation[at]) / FLICKER_FLOOR
+        # The local slope, on which those degrees of freedom rest, is poor at the end: at most one an averaging time.
+        freedom = min(allan.degrees_of_freedom[at], len(self.rate) * self.interval / allan.tau[at])
+        name = f"Allan floor at {allan.tau[at]:.3g} s / 0.664"
+        name += "" if at < len(allan.tau) - 2 else ", not reached: upper limit"
+        return floor, floor / float(np.sqrt(2.0 * freedom)), name
 
     def _figure(self, symbol: str, value: float, std: float, modern: float, modern_std: float, name: str, why: str):
         unit = "deg/sqrt(h)" if symbol in ("ARW", "RWC") else "deg/h"
@@ -247,10 +256,11 @@ class _Run:
 
     def _coloured(self) -> str:
         """Why the noise is not white: its variance is not that of its successive differences (von Neumann's ratio)."""
-        n = len(self.rate)
+        rate = self.rate[np.isfinite(self.rate)]
+        n = len(rate)
         if n < FEWEST_SAMPLES:
             return f"{n} samples cannot show that the noise is white; take {FEWEST_SAMPLES}"
-        excess = float(np.var(self.rate, ddof=1) / (0.5 * np.mean(np.diff(self.rate) ** 2)) - 1.0)
+        excess = float(np.var(rate, ddof=1) / (0.5 * np.mean(np.diff(rate) ** 2)) - 1.0)
         if abs(excess) < max(BROKEN / np.sqrt(n), IMMATERIAL):
             return ""
         return f"the noise is not white: its variance is {1 + excess:.2f} times that of white noise with these steps"
@@ -311,8 +321,10 @@ class _Point(NamedTuple):
 
 
 def _points(runs: list[_Run]) -> list[_Point]:
-    """Steady runs by temperature; all together where no run has a thermometer."""
-    steady = sorted((r for r in runs if not r.unsteady), key=lambda r: r.temperature)
+    """Steady runs by temperature, those without a thermometer left out; all together where no run has one."""
+    steady = [r for r in runs if not r.unsteady]
+    known = sorted((r for r in steady if np.isfinite(r.temperature)), key=lambda r: r.temperature)
+    steady = known or steady
     groups: list[list[_Run]] = []
     for run in steady:
         if groups and not run.temperature - groups[-1][0].temperature > STEADY:

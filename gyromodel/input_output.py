@@ -53,6 +53,8 @@ class InputOutputCurve(eqx.Module):
             CurveError: a rate stands twice, or a number is not finite.
         """
         order = _increasing(rate, output, fewest=2)
+        if covariance is not None and not jnp.isfinite(covariance).all():
+            raise CurveError("the covariance of the test points holds what is not a number: leave those points out")
         known = jnp.zeros((len(order), len(order))) if covariance is None else covariance[order][:, order]
         return cls(cubic_spline(rate[order], output[order]), known)
 
@@ -75,6 +77,8 @@ class InputOutputCurve(eqx.Module):
         """
         order = _increasing(rate, output, fewest=4)
         if output_std is not None:
+            if not (jnp.isfinite(output_std).all() and (output_std > 0).all()):
+                raise CurveError("a standard uncertainty in output_std is not a number above zero: leave its point out")
             fit = smoothing_spline(rate[order], output[order], output_std[order] ** -2.0, variance=jnp.ones(()))
             return cls(fit.spline, fit.covariance)
         fit = smoothing_spline(rate[order], output[order])

@@ -14,6 +14,7 @@ from yaml.reader import ReaderError
 
 from gyromodel import __version__
 from gyromodel._atomic import write_text
+from gyromodel._checks import thermometers
 from gyromodel.effects import Effect
 from gyromodel.effects.drivers import BiasColumn
 from gyromodel.estimate import Calibration, Estimate
@@ -27,8 +28,13 @@ RECORD_KEYS = ("fit", "software")
 # What a scale factor can be: output per rate; a plain number where the output is itself a rate.
 GAIN_UNITS = ("count/deg", "count/(deg/s)", "bit/deg", "bit/(deg/s)", "V/(deg/s)", "V/deg", "A/(deg/s)", "1/deg", "")
 FIT_KEYS = ("degrees_of_freedom", "validity", "data_hash", "covariance")
-VALIDITY_UNITS = {"rate": "deg/s", "temperature": "degC"}
 SETTING_UNITS = {"reference": "degC", "full_rate": "deg/s", "lowest": "deg/s"}
+
+
+def validity_unit(name: str) -> str:
+    """Unit in which the range of a rate or a thermometer is written."""
+    return "deg/s" if name == "rate" else "degC"
+
 
 _NUMBER = re.compile(r"\s*[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?")
 
@@ -125,8 +131,9 @@ def read_calibration(path: str | Path) -> Calibration:
         return Calibration(model)
     fit = top["fit"].mapping(FIT_KEYS, "fit", complete=True)
     validity = {}
-    for name, place in fit["validity"].mapping(tuple(VALIDITY_UNITS), "validity").items():
-        ends = [end.number_in(VALIDITY_UNITS[name]) for end in place.items("a range")]
+    columns = {"rate", "temperature", *(n for e in model.effects for n in thermometers(e.columns_needed))}
+    for name, place in fit["validity"].mapping(tuple(sorted(columns)), "validity").items():
+        ends = [end.number_in(validity_unit(name)) for end in place.items("a range")]
         if len(ends) != 2 or ends[0] > ends[1]:
             raise place.error("a range is its lowest and its highest value")
         validity[name] = (ends[0], ends[1])
@@ -351,7 +358,7 @@ def _document(model: GyroModel, estimate: Estimate | None) -> dict[str, Any]:
 def _fit_record(estimate: Estimate) -> dict[str, Any]:
     record, validity = estimate.record, {}
     for name, ends in estimate.calibration().validity.items():
-        unit = VALIDITY_UNITS[name]
+        unit = validity_unit(name)
         validity[name] = [f"{from_internal(end, unit):.10g} {unit}" for end in ends]
     return {
         "degrees_of_freedom": estimate.degrees_of_freedom,

@@ -15,6 +15,10 @@ from gyromodel.noise import Deviation, Estimator, IdentifiedNoise, deviation, id
 from gyromodel.signals import rate_output
 from gyromodel.units import UnitError, convertible, factor, internal_unit, quantity
 
+# A reference rate that changes by more (deg/s) is a test at speed.
+AT_REST = 0.01
+# Averages that end below this part of the longest possible are said to.
+SHORTENED = 0.25
 LENGTHS_PER_DECADE = 10
 RATE_UNIT = "deg/h"
 # Units of the coefficients of an angular rate, and for any other output what the rate's unit is multiplied by.
@@ -123,6 +127,9 @@ def analyse_noise(campaign: Campaign, progress: Callable[[str, float], None] | N
         CampaignError: the output shows no noise, or the campaign has several axes.
     """
     rate, unit = rate_output(campaign)
+    turned = np.ptp(campaign.in_unit("rate", "deg/s")) if "rate" in campaign.columns else 0.0
+    if turned > AT_REST:
+        raise CampaignError(f"{campaign.name}: column 'rate' changes by {turned:.3g} deg/s, but noise is read at rest")
     time, remarks = campaign.si("time"), []
     if not convertible(unit, RATE_UNIT):
         nominal = _nominal(campaign, unit)
@@ -142,6 +149,9 @@ def analyse_noise(campaign: Campaign, progress: Callable[[str, float], None] | N
     most = max(len(even) // 2, 1)
     lengths = np.unique(np.geomspace(1, most, int(LENGTHS_PER_DECADE * np.log10(most)) + 2).round().astype(int))
     deviations = {name: deviation(even, interval, name, lengths) for name in get_args(Estimator)}
+    reached = deviations["allan"].tau.max(initial=0.0)
+    if reached < SHORTENED * len(even) * interval / 2:
+        remarks.append(f"Missing samples leave no complete averages longer than {reached:.3g} s.")
     if not noise.fits:
         remarks.append(_misfit(noise))
     if noise.approximate:
@@ -160,6 +170,8 @@ def _nominal(campaign: Campaign, unit: str) -> float | None:
         return None
     try:
         value, own = quantity(str(stated))
+        if not value:
+            raise UnitError("it is zero")
         return value * factor(f"({own})*rad/s", unit)
     except UnitError as error:
         raise CampaignError(

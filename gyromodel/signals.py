@@ -77,6 +77,12 @@ def rate_output(campaign: Campaign) -> tuple[np.ndarray, str]:
         return output, unit
     if kind == "angle":
         output = np.diff(output, prepend=np.nan)
+        if (
+            unit == "rad"
+            and np.nanmax(np.abs(output), initial=0.0) > np.pi
+            and np.ptp(campaign.si("output")) <= 2 * np.pi
+        ):
+            raise CampaignError(f"{campaign.name}: the angle in 'output' wraps round within one turn; unwrap it")
     interval = np.diff(campaign.si("time"), prepend=np.nan)
     typical = np.median(interval[1:])
     # How long the first increment took is known only from a regular clock.

@@ -121,6 +121,8 @@ def fit_temperature_model(
     values = np.stack([np.asarray(v, float) for v in quantities.values()])
     known = isinstance(temperature, Uncertain)
     t = np.asarray(temperature.value if known else temperature, float)
+    if not (np.isfinite(values).all() and np.isfinite(t).all()):
+        raise EstimateError(f"{name}: a soak has a value or a temperature that is not a number: leave it out")
     segments, count = 2 if form == "split" else 1, hinges if form == "hinge" else 0
     # A soak keeps its side, wherever in its uncertainty the fit puts its temperature.
     segment = (t >= split).astype(int) if form == "split" else np.zeros(len(t), int)

@@ -101,8 +101,9 @@ def fit_thermistor(
     x = np.log(np.asarray(resistance) / reference)
     segment = np.zeros(len(x), int) if joint is None else np.where(x > 0, 0, 1)
     segments = 1 if joint is None else 2
-    if min(np.bincount(segment, minlength=segments)) < ORDER - continuity:
-        raise EstimateError(f"{name}: a segment needs {ORDER - continuity} points or more for its own terms")
+    fewest = ORDER - continuity + (std is None)
+    if min(np.bincount(segment, minlength=segments)) < fewest:
+        raise EstimateError(f"{name}: a segment needs {fewest} points or more for its own terms and their scatter")
     # 1/T is linear in the coefficients: that solution is the start.
     powers = x[:, None] ** np.arange(ORDER)
     own = [powers[:, continuity:] * (segment == s)[:, None] for s in range(segments)]

@@ -341,6 +341,15 @@ def test_diagnose_writes_its_results(bench: Path, run: Run):
     assert not [path for path in out.rglob("*") if path.name.startswith(".")]
 
 
+def test_noise_is_not_read_at_speed(tmp_path: Path, run: Run):
+    rows = "".join(f"{i},{60 * (i // 50 % 2)},{60 * (i // 50 % 2) + (i * 7919 % 13) / 100}\n" for i in range(400))
+    (tmp_path / "moving.csv").write_text(
+        f"# kind: rate\ntime [s],rate [deg/s],output [deg/s]\n{rows}", encoding="utf-8"
+    )
+    said = refusal(run("allan", tmp_path / "moving.csv", "-o", tmp_path / "out"))
+    assert "column 'rate' changes by 60 deg/s, but noise is read at rest" in said
+
+
 def test_allan_writes_deviations_and_coefficients(bench: Path, run: Run):
     """Of the simulated gyro with 0.02 deg/sqrt(h), but at rest: the motion would be in the way."""
     rest = PLAN.replace(
@@ -368,7 +377,9 @@ def test_allan_writes_deviations_and_coefficients(bench: Path, run: Run):
 
 
 def test_allan_refuses_what_has_no_noise(tmp_path: Path, run: Run):
-    (tmp_path / "campaign.csv").write_text(CAMPAIGN, encoding="utf-8")
+    resting = "".join(f"{line.split(',')[0]},0,{i}\n" for i, line in enumerate(CAMPAIGN.splitlines()[2:]))
+    still = "\n".join(CAMPAIGN.splitlines()[:2]) + "\n" + resting
+    (tmp_path / "campaign.csv").write_text(still, encoding="utf-8")
     assert "at least 64" in refusal(run("allan", tmp_path / "campaign.csv", "-o", tmp_path / "out"))
     axes = CAMPAIGN.replace("output [count/s]", "output_x [count/s]")
     (tmp_path / "campaign.csv").write_text(axes, encoding="utf-8")

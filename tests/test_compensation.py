@@ -27,7 +27,7 @@ from gyromodel.effects.scale import (
     ScaleSpline,
     ScaleTemperature,
 )
-from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureCurve
+from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureCurve, BiasTemperatureGradient
 from gyromodel.estimate import Calibration, fit
 from gyromodel.model import GyroModel, ModelError, model_from_effects, simulate
 
@@ -348,3 +348,12 @@ def test_a_model_without_values_is_no_calibration(effect: Effect):
 def test_a_covariance_of_other_parameters_is_refused():
     with pytest.raises(ModelError, match="1 parameters are free"):
         Calibration(GyroModel((Bias(),)), np.zeros((2, 2)))
+
+
+def test_thermometers_that_the_model_leaves_open_are_the_campaign_s(rng: np.random.Generator):
+    effect = BiasTemperatureGradient(coefficient=value(0.2))
+    pair = {"temperature": 20 + rng.random(ROWS), "temperature_coil": 21 + rng.random(ROWS)}
+    columns = {"time": np.arange(ROWS) * 1.0, "output": 0.2 * (pair["temperature"] - pair["temperature_coil"])}
+    units = {"time": "s", "output": "rad/s", "temperature": "degC", "temperature_coil": "degC"}
+    result = compensate(Campaign(columns | pair, units, {"kind": "rate"}), Calibration(GyroModel((effect,))))
+    assert rates(result) == pytest.approx(0.0, abs=1e-12)

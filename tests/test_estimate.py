@@ -378,6 +378,8 @@ def test_two_stages_carry_the_uncertainty_of_the_first(rng: np.random.Generator)
     assert carried / size == pytest.approx(np.outer(moved, moved) / size, abs=1e-4)
     with pytest.raises(EstimateError, match="holds no parameter that the first one fitted"):
         two_stage(second, first)
+    with pytest.raises(EstimateError, match="holds value of scale_factor at another value than the first one found"):
+        two_stage(first, ends[0])
 
 
 def test_a_fit_that_does_not_converge_is_refused(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch):

@@ -77,7 +77,7 @@ def restricted(log_variances, design, y, groups) -> float:
 def test_scatter_of_groups_is_that_of_greatest_restricted_likelihood(rng: np.random.Generator):
     groups = np.repeat([0, 1, 2], [6, 9, 20])
     design = np.column_stack([np.ones(35), rng.standard_normal((35, 3))])
-    y = design @ [1, 2, -1, 0.5] + np.array([0.05, 1.0, 0.3])[groups] * rng.standard_normal(35)
+    y = design @ [1, 2, -1, 0.5] + np.array([0.05, 3.0, 0.3])[groups] * rng.standard_normal(35)
     names = ("fine", "coarse", "fair")
     fit = fit_function(line, jnp.zeros(4), y, jnp.asarray(design), groups=groups, name=names)
     best = minimize(restricted, 2 * np.log(fit.scatter), (design, y, groups), "Nelder-Mead", options={"xatol": 1e-9})
@@ -195,3 +195,10 @@ def test_three_observations_of_known_error_determine_three_parameters():
     fit = fit_function(decay, START, y, jnp.asarray(X[:3]), std=1e-6)
     assert fit.residual == pytest.approx(np.zeros(3), abs=1e-9)
     assert fit.degrees_of_freedom == 0
+
+
+def test_a_group_without_redundancy_is_refused(rng: np.random.Generator):
+    design = np.column_stack([np.ones(9), np.arange(9) == 8])
+    groups = np.array([0] * 8 + [1])
+    with pytest.raises(EstimateError, match="alone: the parameters take up all 1 observations of one scatter"):
+        fit_function(line, jnp.zeros(2), rng.normal(size=9), jnp.asarray(design), groups=groups, name=("many", "alone"))

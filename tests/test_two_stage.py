@@ -148,9 +148,9 @@ def test_three_stages_state_the_scatter_of_what_they_end_in(rng: np.random.Gener
     true = np.cumsum((BIAS + COEFFICIENT * (HISTORY - REFERENCE)) * STEP)[[29, 59]]
     found = [stages(rng) for _ in range(12)]
     distance = [(a.vector - true) @ np.linalg.solve(a.covariance, a.vector - true) for a, _ in found]
-    assert chi2.ppf(2e-5, 24) < sum(distance) < chi2.ppf(1 - 2e-5, 24)
+    assert chi2.ppf(1e-6, 24) < sum(distance) < chi2.ppf(1 - 1e-6, 24)
     last = sum(((a.vector - true)[1] / a.std[1]) ** 2 for a, _ in found)
-    assert chi2.ppf(2e-5, 12) < last < chi2.ppf(1 - 2e-5, 12)
+    assert chi2.ppf(1e-6, 12) < last < chi2.ppf(1 - 1e-6, 12)
     angle, apart = found[0]
     assert set(angle.budget()) == {"thermometry", "campaign"}
     assert angle.budget()["thermometry"][1] > 0.2

@@ -103,3 +103,13 @@ def test_impossible_covariances_are_refused(covariance: np.ndarray, message: str
 
 def test_sources_are_told_apart_by_what_they_are_and_not_by_their_name():
     assert Source("meter") != Source("meter")
+
+
+@pytest.mark.parametrize("covariance", [[[1, 0.9], [0, 1]], [-1e-12, 1.0], [np.nan, 1.0], [[0.0, 1e-9], [1e-9, 1.0]]])
+def test_what_is_no_covariance_is_refused(covariance: list):
+    with pytest.raises(ValueError, match="a covariance is finite and symmetric"):
+        Uncertain.stated(jnp.zeros(2), covariance, "stated")
+
+
+def test_whole_numbers_are_values():
+    assert Uncertain.stated(300, 4.0, "stated").propagate(lambda x: 2.0 * x).std == pytest.approx([4.0])

@@ -107,6 +107,10 @@ class LockInDithered(Effect):
     fringe_angle: Float[Array, ""] = parameter("arcsec", 2.0, "S: turn of one fringe", linear=False, default=9.7e-6)
     harmonics: int = eqx.field(static=True, default=8)
 
+    def __check_init__(self) -> None:
+        if 2 * math.pi * abs(float(self.dither_amplitude / self.fringe_angle)) + self.harmonics > BESSEL_POINTS:
+            raise ValueError(f"a dither of more than {BESSEL_POINTS} / 2π fringes is not computed: check its amplitude")
+
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """The errors of all bands together."""
         order = jnp.arange(-self.harmonics, self.harmonics + 1)

@@ -163,7 +163,7 @@ class ScaleTemperature(Effect):
 
 
 class ScaleTemperatureCurve(Effect):
-    """ε += Σ a_i (T − T0)^i + Σ h_j max(T − T_j, 0): scale factor curved over temperature."""
+    """ε += Σ a_i ((T − T0)/10 °C)^i + Σ h_j max(T − T_j, 0): scale factor curved over temperature."""
 
     id = "scale_temperature_curve"
     site = "scale"
@@ -181,7 +181,7 @@ class ScaleTemperatureCurve(Effect):
         check_curve(self.coefficients, self.hinges, self.breakpoints)
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
-        """Powers, then hinges."""
+        """Powers of (T − T0)/10 °C, from the first on, then max(T − T_j, 0) of each breakpoint."""
         powers = self.coefficients.shape[0]
         return curve_columns(signals["temperature"], self.reference, powers, self.breakpoints)
 

@@ -40,7 +40,7 @@ class BiasTemperature(Effect):
 
 
 class BiasTemperatureCurve(Effect):
-    """E += Σ a_i (T − T0)^i + Σ h_j max(T − T_j, 0): bias curved over temperature."""
+    """E += Σ a_i ((T − T0)/10 °C)^i + Σ h_j max(T − T_j, 0): bias curved over temperature."""
 
     id = "bias_temperature_curve"
     site = "rate"
@@ -58,7 +58,7 @@ class BiasTemperatureCurve(Effect):
         check_curve(self.coefficients, self.hinges, self.breakpoints)
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
-        """Powers, then hinges."""
+        """Powers of (T − T0)/10 °C, from the first on, then max(T − T_j, 0) of each breakpoint."""
         powers = self.coefficients.shape[0]
         return curve_columns(signals["temperature"], self.reference, powers, self.breakpoints)
 

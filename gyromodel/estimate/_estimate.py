@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from gyromodel._checks import thermometers
 from gyromodel.estimate._calibration import Calibration, ParameterRow
 from gyromodel.model import GyroModel, parameter_unit
 from gyromodel.noise import NOISE_UNITS, NoiseRatios, coefficients
@@ -87,7 +88,8 @@ class Estimate:
                 unit = parameter_unit(effect, next(iter(effect.declared())), record.output_unit, record.units)
                 effect = replace(effect, unit=unit)  # pyright: ignore[reportCallIssue]
             effects.append(effect)
-        for name in ("rate", "temperature"):
+        needed = (n for effect in self.model.effects for n in effect.columns_needed)
+        for name in dict.fromkeys(["rate", "temperature", *thermometers(needed)]):
             values = np.ravel(record.signals.get(name, np.nan))[: record.rows]
             if np.isfinite(values).any():
                 validity[name] = (float(np.nanmin(values)), float(np.nanmax(values)))

@@ -35,6 +35,8 @@ MAXIMUM_ITERATIONS = 500
 UNSCALED_ITERATIONS = 10_000
 # Rounds of fit and scatter of groups, of the scatter in one linearised fit, and the relative change that ends both.
 SCALE_ROUNDS, LINEAR_ROUNDS, SCALE_CLOSE = 20, 500, 1e-6
+# Observations that the parameters leave a group; with fewer its scatter is rounding.
+LEAST_FREEDOM = 1e-6
 # Least scatter of a group, as a part of what the errors of the given values do to its observations.
 HIDDEN = 1e-3
 # A minimum whose sum of squares is this improbable, the errors being known, is a false one until other starts agree.
@@ -119,7 +121,7 @@ def fit_function(
         iterations, start = iterations + solution.iterations, solution.x
         if known:
             break
-        before, scatter = scatter, _scatter(problem, solution.x, sizes, scatter)
+        before, scatter = scatter, _scatter(problem, solution.x, sizes, scatter, names)
         if alone or _close(scatter, before, y):
             break
     else:
@@ -275,7 +277,7 @@ def _names(tree: Any) -> list[str]:
     return found
 
 
-def _scatter(problem: _Problem, x: np.ndarray, sizes: np.ndarray, scatter: np.ndarray) -> np.ndarray:
+def _scatter(problem: _Problem, x: np.ndarray, sizes: np.ndarray, scatter: np.ndarray, names: list[str]) -> np.ndarray:
     """Scatter of each group in the linearised fit: squares of its residual over its redundancy (Förstner 1979)."""
     residual, jacobian = problem.linearise(x, np.ones(len(sizes)))
     # Data without any scatter are held to their last digit, and not divided by zero.
@@ -288,6 +290,12 @@ def _scatter(problem: _Problem, x: np.ndarray, sizes: np.ndarray, scatter: np.nd
         weight = np.ones(len(residual))
         weight[: len(sizes)] = 1.0 / (sizes * scatter[problem.groups])
         basis, expected = _redundancy(problem, jacobian * weight[:, None])
+        if expected.min() < LEAST_FREEDOM:
+            group = int(np.argmin(expected))
+            raise EstimateError(
+                f"{names[group]}: the parameters take up all {np.sum(problem.groups == group)} observations of one "
+                "scatter, and leave none to tell it from: measure more, or state standard deviations"
+            )
         left = residual * weight
         left -= basis @ (basis.T @ left)
         squares = np.bincount(problem.groups, left[: len(sizes)] ** 2)

@@ -76,6 +76,9 @@ def _response(model: GyroModel, held: GyroModel | None, changes, signals, signal
 
 @eqx.filter_jit
 def _solve(model: GyroModel, x, signals, filter: Filter):
+    # A derivative through what is masked must be a number too.
+    signals = {name: jnp.where(filter.present | jnp.isfinite(v), v, 0.0) for name, v in signals.items()}
+
     def whitened(v):
         residual = jnp.where(filter.present, model.with_vector(v).predict(signals) - signals["output"], 0.0)
         return whiten(filter, residual[:, None])[:, 0]

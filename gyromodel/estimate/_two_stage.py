@@ -24,6 +24,8 @@ Columns = Callable[[Any], Mapping[str, Float[Array, " sample"]]]
 
 # Largest difference between a column that was fitted with and the one the first stage gives, of the column's range.
 SAME_COLUMN = 1e-6
+# Largest difference of a parameter held from the one found, of its value or its standard uncertainty.
+SAME_VALUE = 1e-6
 
 
 def two_stage(first: Estimate | Uncertain, second: Estimate, columns: Columns | None = None) -> Estimate:
@@ -75,7 +77,14 @@ def _held(first: Estimate, second: Estimate) -> tuple[GyroModel, list[int]]:
     of_held = [(held.labels[s.effect], s.field, s.index) for s in held.slots()]
     if not of_held:
         raise EstimateError("the second fit holds no parameter that the first one fitted: fix it in the second model")
-    return held, [of_first.index(slot) for slot in of_held]
+    order = [of_first.index(slot) for slot in of_held]
+    found, held_at = np.asarray(first.model.vector())[order], np.asarray(held.vector())
+    for slot, there, here, std in zip(of_held, found, held_at, first.std[order], strict=True):
+        if abs(here - there) > SAME_VALUE * max(abs(there), std):
+            raise EstimateError(
+                f"the second fit holds {slot[1]} of {slot[0]} at another value than the first one found: fix it there"
+            )
+    return held, order
 
 
 def _changes_of_columns(
@@ -90,8 +99,9 @@ def _changes_of_columns(
     for name, values in of(jnp.asarray(given.vector)).items():
         if name not in record.signals or np.shape(values) != (record.rows,):
             raise EstimateError(f"the second fit's campaign has no column {name} of {np.size(values)} rows")
-        used = np.asarray(record.signals[name])[: record.rows]
-        if np.abs(used - np.asarray(values)).max() > SAME_COLUMN * max(np.ptp(used), np.abs(used).max()):
+        used = np.asarray(record.signals[name])[: record.rows][record.present]
+        apart = np.abs(used - np.asarray(values)[record.present]).max()
+        if not apart <= SAME_COLUMN * max(np.ptp(used), np.abs(used).max()):
             raise EstimateError(f"the second fit saw another {name} than the first stage gives: fit it again")
         slope = jax.jacfwd(lambda v, name=name: of(v)[name])(jnp.asarray(given.vector))
         found[name] = np.asarray(slope) @ errors

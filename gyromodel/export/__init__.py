@@ -5,6 +5,7 @@ from typing import Literal
 from gyromodel.estimate import Calibration
 from gyromodel.export._c import as_c
 from gyromodel.export._tables import as_csv, as_json
+from gyromodel.model import ModelError
 
 __all__ = ["Form", "export_calibration"]
 
@@ -20,6 +21,12 @@ def export_calibration(calibration: Calibration, to: Form) -> str:
             it takes to compute the model elsewhere; "csv", one row a number.
 
     Raises:
-        ModelError: to C, an effect that looks at other samples, or computes what a few C statements cannot.
+        ModelError: an effect does not say which columns it reads; to C, one that looks at other samples, or computes
+            what a few C statements cannot.
     """
+    for effect in calibration.model.effects:
+        if unnamed := [name for name in effect.columns_needed if "<" in name]:
+            raise ModelError(
+                f"effect {effect.label} does not say which column {unnamed[0]} is: fit it, or state `between`"
+            )
     return {"c": as_c, "json": as_json, "csv": as_csv}[to](calibration)

@@ -52,7 +52,9 @@ def as_c(calibration: Calibration) -> str:
         if NEIGHBOUR in reached:
             raise ModelError(f"effect {effect.label} cannot be exported to C: it looks at other samples than its own")
     statements, reached, output, slope = _lowered(model, members)
-    meanings = SIGNAL_MEANINGS | {f"{name}_rate": "of a smoothed thermometer" for name in thermometers(members)}
+    meanings = SIGNAL_MEANINGS | {
+        f"{name}_rate": "of a smoothing spline through the thermometer's whole record" for name in thermometers(members)
+    }
     fields = [
         f"    double {member};" + (f" /* {meanings[name]} */" if name in meanings else "")
         for name, member in members.items()

@@ -16,7 +16,7 @@ from gyromodel import __version__
 from gyromodel._checks import usual_unit
 from gyromodel.effects.drivers import BiasColumn
 from gyromodel.estimate import Calibration
-from gyromodel.model_files import SETTING_UNITS, VALIDITY_UNITS, parameter_names
+from gyromodel.model_files import SETTING_UNITS, parameter_names, validity_unit
 from gyromodel.noise import NOISE_UNITS
 from gyromodel.units import factor, from_internal, internal_unit
 
@@ -85,8 +85,8 @@ def validity(calibration: Calibration) -> dict[str, tuple[float, float, str]]:
     """Lowest and highest calibrated value and their unit, by column."""
     found = {}
     for name, ends in calibration.validity.items():
-        low, high = (float(end) for end in from_internal(ends, VALIDITY_UNITS[name]))
-        found[name] = low, high, VALIDITY_UNITS[name]
+        low, high = (float(end) for end in from_internal(ends, validity_unit(name)))
+        found[name] = low, high, validity_unit(name)
     return found
 
 
@@ -118,7 +118,7 @@ def as_json(calibration: Calibration) -> str:
             "needs": list(effect.columns_needed),
             "parameters": [
                 {"name": e.name, "value": e.value, "std": None if e.std != e.std else e.std, "unit": e.unit,
-                 "fixed": e.kind == "fixed"}
+                 "meaning": effect.declared()[e.name.partition("[")[0]].meaning, "fixed": e.kind == "fixed"}
                 for e in group if e.kind != "setting"
             ],
             "settings": [{"name": e.name, "value": e.value, "unit": e.unit} for e in group if e.kind == "setting"],

@@ -51,13 +51,19 @@ class Uncertain:
             degrees_of_freedom: behind the covariance; infinite if it is known exactly.
 
         Raises:
-            ValueError: the covariance has another size than the value, or negative eigenvalues.
+            ValueError: the covariance has another size than the value, or is none.
         """
-        vector, build = ravel_pytree(value)
+        vector, build = ravel_pytree(jax.tree.map(lambda leaf: jnp.asarray(leaf, float), value))
         size, covariance = len(vector), np.asarray(covariance, float)
         if covariance.shape not in {(), (size,), (size, size)}:
             raise ValueError(f"{name}: a covariance of shape {covariance.shape} does not fit a value of {size} entries")
         matrix = covariance if covariance.ndim == 2 else np.diag(np.broadcast_to(covariance, size))
+        largest = np.sqrt(np.abs(np.outer(np.diag(matrix), np.diag(matrix))))
+        usable = np.isfinite(matrix).all() and (np.diag(matrix) >= 0).all() and not matrix[largest == 0].any()
+        if not usable or (np.abs(matrix - matrix.T) > 1e-9 * largest).any():
+            raise ValueError(
+                f"{name}: a covariance is finite and symmetric, and nothing varies with what does not vary"
+            )
         return cls(np.asarray(vector), build, {Source(name, degrees_of_freedom): factor_of(matrix)})
 
     @property
