@@ -133,12 +133,19 @@ def _summed(rate: np.ndarray, twice: bool) -> _Record:
     if not twice:
         return _Record((jnp.asarray(angle),), None if missing is None else jnp.asarray(missing))
     # Multiples of a power of two that add up, also times 8 for a difference, without rounding.
-    grid = 2.0 ** np.ceil(np.log2(8.0 * n * max(np.abs(angle).max(), 1e-300)) - 52)
-    coarse = np.round(angle / grid) * grid
-    fine = angle - coarse
-    for part in (coarse, fine):
+    grid = 2.0 ** np.ceil(np.log2(8.0 * n * max(angle.max(), -angle.min(), 1e-300)) - 52)
+    # In place: ten million rows take longer to find room for than to add up.
+    coarse = angle / grid
+    np.round(coarse, out=coarse)
+    coarse *= grid
+    fine = np.subtract(angle, coarse, out=angle)
+
+    def sum_up(part: np.ndarray) -> None:
         np.cumsum(part[: n + 1], out=part[1 : n + 2])
         part[0] = 0.0
+
+    with ThreadPoolExecutor(_THREADS) as pool:
+        list(pool.map(sum_up, (coarse, fine)))
     # A term takes n + 2 sums, but the last sample it needs is one before its last angle.
     behind = None if missing is None else jnp.asarray(np.concatenate([[0], missing[:-1]]))
     return _Record((jnp.asarray(coarse), jnp.asarray(fine)), behind)
