@@ -283,13 +283,12 @@ def refit(record: Record, baseline: Estimate, found: list[Found], noise: NoisePa
 
 
 def _shapes_held(model: GyroModel, found: list[Found]) -> GyroModel:
-    held = {
-        (f.effect.label, name)
-        for f in found
-        if f.effect is not None
-        for name, declared in f.effect.declared().items()
-        if not declared.linear
-    }
+    """The model with shapes at their searched values, but for effects that have no free coefficient besides."""
+    held = set()
+    for effect in (f.effect for f in found if f.effect is not None):
+        linear = {name for name, declared in effect.declared().items() if declared.linear}
+        if linear - set(effect.held):
+            held |= {(effect.label, name) for name in effect.declared() if name not in linear}
     return replace_fixed(model, model.fixed | frozenset(held))
 
 
