@@ -1,8 +1,21 @@
-"""The report room: the verdict in a sentence, and a page with the figures and tables behind it."""
+"""The report room: the verdict in a sentence, a page with the figures and tables behind it, and deviations drawn."""
 
-from gyromodel.report._deviation import deviation_figure, noise_rows
+from typing import TYPE_CHECKING, Any
+
 from gyromodel.report._numbers import with_uncertainty
 from gyromodel.report._page import write_report
 from gyromodel.report._sentence import sentence
 
+if TYPE_CHECKING:
+    from gyromodel.report._deviation import deviation_figure, noise_rows
+
 __all__ = ["deviation_figure", "noise_rows", "sentence", "with_uncertainty", "write_report"]
+
+
+def __getattr__(name: str) -> Any:
+    """What needs NumPy and JAX is imported when it is used: a sentence does not."""
+    if name not in ("deviation_figure", "noise_rows"):
+        raise AttributeError(f"module 'gyromodel.report' has no attribute {name!r}")
+    from gyromodel.report import _deviation
+
+    return getattr(_deviation, name)
