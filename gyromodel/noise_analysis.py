@@ -86,7 +86,11 @@ class NoiseAnalysis:
                 "alternatives": list(term.alternatives),
                 "in_model": term.in_model,
             }
-        terms["noise_markov"]["time_constant_s"] = self.noise.terms["noise_markov"].time_constant
+        markov = self.noise.terms["noise_markov"]
+        terms["noise_markov"]["time_constant_s"] = markov.time_constant
+        terms["noise_markov"]["bounds"] = [
+            {"time_constant_s": c, "bound": b * self.scale_of("noise_markov")} for c, b in markov.bounds
+        ]
         return {
             "campaign": self.name,
             "unit": self.unit,
@@ -104,7 +108,12 @@ class NoiseAnalysis:
             },
             "noise": terms,
             "lines": [
-                {"frequency_hz": x.frequency, "amplitude": x.amplitude * self.scale, "std": x.std * self.scale}
+                {
+                    "frequency_hz": x.frequency,
+                    "frequency_std_hz": x.frequency_std,
+                    "amplitude": x.amplitude * self.scale,
+                    "std": x.std * self.scale,
+                }
                 for x in self.noise.lines
             ],
             "fits": self.noise.fits,

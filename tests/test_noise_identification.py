@@ -13,6 +13,7 @@ from gyromodel.files import read_campaign
 from gyromodel.noise import IdentifiedNoise, identify_noise
 from gyromodel.noise import _reduced as reduction
 from gyromodel.noise._identify import KINDS
+from gyromodel.noise._lines import find_lines
 from gyromodel.noise._reduced import Mixture
 from gyromodel.noise_analysis import analyse_noise
 from gyromodel.numerics.markov_cells import MarkovCells, Rows, log_determinant_and_gram
@@ -193,6 +194,33 @@ def test_lines_and_trend_are_taken_out_of_the_noise(fixed: np.random.Generator):
     assert ramp.value == pytest.approx(1e-3, rel=0.1)
     assert found.terms["noise_white"].value == pytest.approx(N, rel=0.1)
     assert found.fits
+
+
+@pytest.mark.parametrize("walk", [0.0, 0.02])
+def test_noise_alone_seldom_shows_a_line(walk: float, rng: np.random.Generator):
+    """One record in a thousand, in white noise and above a random walk; the shortest have a window for a spectrum."""
+    time, found = np.arange(ROWS) * STEP, 0
+    for _ in range(400):
+        rate = white(rng) + walk * np.sqrt(STEP) * rng.standard_normal(ROWS).cumsum()
+        found += bool(find_lines(rate, time, STEP))
+    assert binom.sf(found - 1, 400, 1e-3) > RARE
+
+
+def test_limits_of_lines_and_of_unseen_markov_noise_hold(rng: np.random.Generator):
+    """A line, and a Markov process too small to be found: its bound holds, and is not far above it."""
+    time, constant, q = np.arange(ROWS) * STEP, 10.0, 2.5e-3
+    hits, bounds = np.zeros(3, int), []
+    for _ in range(16):
+        line = 0.02 * np.cos(2 * np.pi * 0.3111 * time + rng.uniform(0, 6))
+        found = identified(white(rng) + truth.markov(ROWS, STEP, q, constant, rng) + line)
+        first, term = found.lines[0], found.terms["noise_markov"]
+        limits = dict(term.bounds)
+        bounds.append(limits.get(constant, np.inf))
+        off = abs(first.amplitude - 0.02) / first.std, abs(first.frequency - 0.3111) / first.frequency_std
+        hits += [off[0] < 1.96, off[1] < 1.96, bounds[-1] > q]
+    for held in hits:
+        assert binom.cdf(held, 16, 0.93) > RARE
+    assert np.median(bounds) < 3.0 * q
 
 
 def test_gaps_and_missing_samples_do_not_matter(fixed: np.random.Generator):

@@ -103,10 +103,29 @@ class Fits:
 
     def ends(self, searches: Sequence[Search]) -> np.ndarray:
         """Where profile likelihoods have fallen far enough, side by side; −inf for a variance of zero."""
-        index, which = np.arange(len(searches)), [s.parameter for s in searches]
         tops = np.array([self.found[s.model][1] for s in searches])
         places = np.array([self.found[s.model][0] for s in searches])
         free = np.array([[*s.model, s.model[MARKOV]] for s in searches])
+        return self._ends(searches, places, tops, free)
+
+    def markov_bounds(self, model: Model, constants: np.ndarray, reach: float) -> np.ndarray:
+        """Upper ends for a Markov process beside the kinds of a model, one for each of some time constants."""
+        search = Search((*model[:MARKOV], True), MARKOV, reach, True)
+        places = np.tile(self.found[model][0], (len(constants), 1))
+        places[:, TIME_CONSTANT] = np.log(constants)
+        places[:, MARKOV] = self.markov_start(constants)
+        free = np.tile([*search.model, False], (len(constants), 1))
+        places, tops = maximise(self.log_likelihood, places, free, self.low, self.high)
+        return self._ends([search] * len(constants), places, np.maximum(tops, self.found[model][1]), free)
+
+    def markov_start(self, constants: np.ndarray) -> np.ndarray:
+        """ln q² at which the Allan variance at 1.89 time constants, 0.191 q²Tc, is half of what is seen there."""
+        return np.log(0.5 * self.variance_at(1.89 * constants) / (0.191 * constants))
+
+    def _ends(self, searches: Sequence[Search], places: np.ndarray, tops: np.ndarray, free: np.ndarray) -> np.ndarray:
+        """From the maxima `places` of height `tops`, over the parameters that are free."""
+        index, which = np.arange(len(searches)), [s.parameter for s in searches]
+        free = free.copy()
         free[index, which] = False
         sign, reach = np.array([1.0 if s.up else -1.0 for s in searches]), np.array([s.reach for s in searches])
         # A parameter that went out of sight starts from where the record would begin to show it.

@@ -28,7 +28,7 @@ from gyromodel.noise._fits import (
     Model,
     Search,
 )
-from gyromodel.noise._lines import MOST_LINES, Spectrum, background, find_lines, line_columns, spectrum
+from gyromodel.noise._lines import HANN, MOST_LINES, Spectrum, background, find_lines, line_columns, spectrum
 from gyromodel.noise._reduced import MOST_ROWS, Mixture, reduced
 
 Verdict = Literal["found", "ambiguous", "doubtful", "not identifiable"]
@@ -43,8 +43,6 @@ TREND = 12.0
 # Frequencies per bin of the whitened spectrum, and bins. All bins together contradict the model this seldom by chance;
 # those are named that miss it by this factor and this many standard deviations.
 FEWEST_IN_BIN, BINS, BY_CHANCE, MISFIT, APART = 24, 40, 1e-4, 1.25, 2.6
-# Loss of independent frequencies by the Hann window: 1 + 2 (4/9 + 1/36).
-HANN = 35.0 / 18.0
 FIRST_IN_BIN = 4
 FEWEST = 64
 # A step longer than this many intervals leaves out samples.
@@ -68,7 +66,8 @@ class NoiseTerm(NamedTuple):
     `value` with its 95 % limits where `verdict` is found; where it is ambiguous, the size if it is this kind rather
     than one of `alternatives`; where it is not identifiable, the record shows no more than the upper limit, at 95 %. Of
     kinds that stand for one another only one is `in_model`. What would be found or ambiguous is doubtful where the
-    spectrum contradicts the model. A Markov process has its time constant (s) beside it.
+    spectrum contradicts the model. A Markov process has its time constant (s) beside it; where there is none, `bounds`
+    are 95 % upper limits by time constant (s), for fast ones pass for white noise and slow ones for a random walk.
     """
 
     value: float
@@ -78,18 +77,25 @@ class NoiseTerm(NamedTuple):
     in_model: bool
     alternatives: tuple[str, ...] = ()
     time_constant: float = float("nan")
+    bounds: tuple[tuple[float, float], ...] = ()
 
     def scaled(self, unit: float) -> NoiseTerm:
         """The same in another unit."""
-        return self._replace(value=self.value * unit, low=self.low * unit, high=self.high * unit)
+        bounds = tuple((constant, bound * unit) for constant, bound in self.bounds)
+        return self._replace(value=self.value * unit, low=self.low * unit, high=self.high * unit, bounds=bounds)
 
 
 class Line(NamedTuple):
-    """A steady line: frequency (Hz), amplitude in the unit of the rate, and its standard error."""
+    """A steady line: frequency (Hz) and amplitude in the unit of the rate, with their standard errors.
+
+    1.96 standard errors lead to where the likelihood, at its maximum over phase and frequency, has fallen to 95 %
+    limits: it falls with the square of the amplitude's change.
+    """
 
     frequency: float
     amplitude: float
     std: float
+    frequency_std: float
 
 
 class IdentifiedNoise(NamedTuple):
@@ -203,10 +209,13 @@ def _identify(rate, time, restart, present, tell) -> IdentifiedNoise:
     units = (interval**0.5, interval, 1.0, 1.0, 1.0)
     terms = {KINDS[k]: t.scaled(scale * units[k]) for k, t in _terms(fits, chosen).items()}
     terms["noise_rate_ramp"] = ramp.scaled(scale / span)
-    power = spectrum(y[clean], interval)
-    errors = np.sqrt(2.0 * np.interp(frequencies, power.frequency, background(power.power)) / span) * scale
-    lines = zip(frequencies, np.hypot(*sizes.reshape(-1, 2).T) * scale, errors, strict=True)
-    misfits = _misfits(fits.mixture(fits.found[chosen][0][None]), power, interval)
+    power, noise = spectrum(y[clean], interval), fits.mixture(fits.found[chosen][0][None])
+    misfits = _misfits(noise, power, interval)
+    around = np.interp(frequencies, power.frequency, background(power.power))
+    density = around if misfits else _density(noise, frequencies, interval)
+    amplitudes, errors = np.hypot(*sizes.reshape(-1, 2).T), np.sqrt(2.0 * density / (present.sum() * interval))
+    shifts = errors / (amplitudes * 2.0 * np.pi * time[present].std())
+    lines = zip(frequencies, amplitudes * scale, errors * scale, shifts, strict=True)
     if misfits or more:
         terms |= {
             k: t._replace(verdict="doubtful")
@@ -292,9 +301,7 @@ def _try_markov(fits: Fits, chosen: Model) -> None:
         constants = np.linspace(fits.low[TIME_CONSTANT] + 1.0, fits.high[TIME_CONSTANT] - 1.0, 8)
         points = np.tile(fits.found[model][0], (len(constants), 1))
         points[:, TIME_CONSTANT] = constants
-        # At the level where its Allan variance, about q²Tc/5 at 2 Tc, is half of what is seen there.
-        seen = fits.variance_at(1.89 * np.exp(constants))
-        points[:, MARKOV] = np.log(0.5 * seen / 0.191) - constants
+        points[:, MARKOV] = fits.markov_start(np.exp(constants))
         nearest = np.argsort(fits.log_likelihood(points))[-2:]
         fits.fit([(*model[:MARKOV], True)] * 2, list(points[nearest]))
 
@@ -341,8 +348,10 @@ def _terms(fits: Fits, chosen: Model) -> dict[int, NoiseTerm]:
     out: dict[int, NoiseTerm] = {}
     for k in range(len(KINDS)):
         if (k, True) not in ends:
-            # Without a time constant a Markov process has no bound: white noise and random walk are its limits.
-            out[k] = NoiseTerm(0.0, 0.0, float("inf"), "not identifiable", False)
+            constants = _time_constants(fits)
+            bounds = np.exp(0.5 * fits.markov_bounds(union, constants, BOUND))
+            told = tuple((float(c), float(b)) for c, b in zip(constants, bounds, strict=True))
+            out[k] = NoiseTerm(0.0, 0.0, float("inf"), "not identifiable", False, bounds=told)
             continue
         model = chosen if chosen[k] else peers[k] if union[k] else wider[k]
         point = fits.found[model][0]
@@ -357,6 +366,13 @@ def _terms(fits: Fits, chosen: Model) -> dict[int, NoiseTerm]:
     return out
 
 
+def _time_constants(fits: Fits) -> np.ndarray:
+    """Powers of ten from ten intervals to a tenth of the record, or their middle if there is none."""
+    shortest, longest = 10.0 * fits.interval, 0.1 * fits.span
+    powers = 10.0 ** np.arange(np.ceil(np.log10(shortest)), np.floor(np.log10(longest)) + 1)
+    return powers if len(powers) else np.sqrt([shortest * longest])
+
+
 def _joined(fits: Fits, chosen: Model, peers: dict[int, Model], union: Model) -> np.ndarray:
     """A start for the kinds of several models together."""
     x = fits.found[chosen][0].copy()
@@ -368,14 +384,17 @@ def _joined(fits: Fits, chosen: Model, peers: dict[int, Model], union: Model) ->
     return x
 
 
-def _misfits(noise: Mixture, seen: Spectrum, interval: float) -> tuple[tuple[float, float, float], ...]:
-    """Bands where the spectrum is not the model's: from, to (Hz), measured over fitted power."""
-    omega = 2.0 * np.pi * seen.frequency * interval
-    difference = 4.0 * np.sin(0.5 * omega) ** 2
+def _density(noise: Mixture, frequency: np.ndarray, interval: float) -> np.ndarray:
+    """Two-sided PSD of the first mixture at some frequencies (Hz)."""
+    difference = 4.0 * np.sin(np.pi * frequency * interval) ** 2
     phi, variance = noise.correlation[:, 0, None], noise.variance[:, 0, None]
     fitted = noise.white[0] + noise.differenced[0] * difference + noise.walk[0] / difference
-    fitted = fitted + (variance * (1.0 - phi**2) / ((1.0 - phi) ** 2 + phi * difference)).sum(0)
-    ratio = (seen.power / (fitted * interval))[FIRST_IN_BIN:]
+    return (fitted + (variance * (1.0 - phi**2) / ((1.0 - phi) ** 2 + phi * difference)).sum(0)) * interval
+
+
+def _misfits(noise: Mixture, seen: Spectrum, interval: float) -> tuple[tuple[float, float, float], ...]:
+    """Bands where the spectrum is not the model's: from, to (Hz), measured over fitted power."""
+    ratio = (seen.power / _density(noise, seen.frequency, interval))[FIRST_IN_BIN:]
     frequency = seen.frequency[FIRST_IN_BIN:]
     if len(ratio) < 2 * FEWEST_IN_BIN:
         return ()

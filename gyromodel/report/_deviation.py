@@ -42,8 +42,8 @@ def noise_rows(analysis: NoiseAnalysis) -> list[tuple[str, ...]]:
         verdict = term.verdict
         if verdict == "not identifiable":
             value, low = "–", "–"
-            bounded = np.isfinite(term.high)
-            verdict, high = (f"not identifiable: below {high} (95 %)", "–") if bounded else ("not identifiable", "–")
+            limits = [f"{b * size:.3g} for {c:g} s" for c, b in term.bounds] or [high]
+            verdict, high = f"not identifiable: below {', '.join(limits)} (95 %)", "–"
         elif verdict == "ambiguous" and term.alternatives:
             verdict = f"ambiguous: this or {' or '.join(_NAMES[name] for name in term.alternatives)}"
         elif verdict == "doubtful":
