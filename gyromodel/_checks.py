@@ -17,6 +17,8 @@ DERIVED = re.compile(r"time_on|temperature(_.+)?_rate")
 _THERMOMETER = re.compile(r"temperature(_.+)?(?<!_rate)")
 KINDS = ("rate", "increment", "angle")
 MAX_METADATA = 10_000
+# A step in time of more than this many nominal ones leaves out samples.
+MISSING_STEP = 1.5
 
 # What the unit of a known column must measure, by examples: one of their dimensions is required.
 _EXPECTED = tuple(

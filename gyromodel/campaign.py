@@ -18,6 +18,7 @@ import numpy as np
 
 from gyromodel import units as unit_system
 from gyromodel._checks import (
+    MISSING_STEP,
     CampaignError,
     check_metadata,
     check_output_unit,
@@ -143,7 +144,7 @@ class Campaign:
             steps = np.diff(self.si("time"))
         if not len(steps):
             return []
-        rows = np.flatnonzero(steps > 1.5 * np.median(steps))
+        rows = np.flatnonzero(steps > MISSING_STEP * np.median(steps))
         return [(int(row) + 1, float(steps[row])) for row in rows]
 
     def digest(self) -> str:

@@ -17,9 +17,8 @@ from jaxtyping import Array, Float
 from gyromodel._checks import thermometers
 from gyromodel.campaign import Campaign
 from gyromodel.effects import Signals
-from gyromodel.estimate import Calibration, check_covariates
+from gyromodel.estimate import Calibration, check_covariates, validity_unit
 from gyromodel.model import GyroModel, check_units
-from gyromodel.model_files import validity_unit
 from gyromodel.signals import Record, read_signals
 from gyromodel.units import from_internal
 

@@ -16,14 +16,15 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.stats import f as fisher
 
+from gyromodel._checks import MISSING_STEP
 from gyromodel.campaign import Campaign
 from gyromodel.effects.drivers import Bias
 from gyromodel.estimate import Estimate, EstimateError, filter_of, fit_record, with_noise_intervals
 from gyromodel.model import GyroModel
-from gyromodel.noise import deviation
+from gyromodel.noise import deviation, with_gaps
 from gyromodel.numerics.state_space import colour
-from gyromodel.signals import Record, read_signals
-from gyromodel.units import convertible, factor, internal_unit, quantity
+from gyromodel.signals import Record, rate_scale, read_signals
+from gyromodel.units import UnitError, factor, internal_unit
 
 # A run counts as at one temperature, and runs as at the same one, within this (°C).
 STEADY = 1.0
@@ -190,7 +191,7 @@ class _Run:
         # The first row of angles has no rate: only what is missing between the first and the last one is a gap.
         ends = np.flatnonzero(record.present)[[0, -1]]
         step = np.diff(np.asarray(record.signals["time"])[ends[0] : ends[1] + 1])
-        missing = int((~record.present[ends[0] : ends[1]]).sum() + (step > 1.5 * record.interval).sum())
+        missing = int((~record.present[ends[0] : ends[1]]).sum() + (step > MISSING_STEP * record.interval).sum())
         gap = f"the run has {missing} gaps or missing samples; use a stretch without" if missing else ""
         return cls(name, rate, record.interval, record, estimate, float(plain.std[0]), temperature, unsteady, gap)
 
@@ -225,7 +226,8 @@ class _Run:
 
     def _floor(self) -> tuple[float, float, str]:
         """Bias instability off the lowest Allan deviation, its standard uncertainty, and where it was read."""
-        allan = deviation(self.rate, self.interval)
+        time = np.asarray(self.record.signals["time"])[: self.record.rows]
+        allan = deviation(with_gaps(self.rate, time, self.interval), self.interval)
         if len(allan.tau) < 3:
             return np.nan, np.nan, "Allan floor: too few samples between gaps"
         at = int(np.argmin(allan.deviation))
@@ -275,14 +277,15 @@ def _as_rate(campaign: Campaign, scale_factor: str | None) -> Record:
     if record.output_unit == "rad/s":
         return record
     text = scale_factor or campaign.metadata.get("nominal_scale_factor")
-    wanted, example = f"{record.output_unit}/(rad/s)", f"0.09 {record.output_unit}/(deg/h)"
+    example = f"0.09 {record.output_unit}/(deg/h)"
     said = f"{campaign.name}: the output is in [{record.output_unit}]: "
     if text is None:
         raise EstimateError(f"{said}state the nominal scale factor, such as {example}")
-    value, unit = quantity(str(text))
-    if not convertible(unit, wanted) or value == 0:
-        raise EstimateError(f"{said}a scale factor of {text} does not give that, {example} would")
-    output = record.signals["output"] / (value * factor(unit, wanted))
+    try:
+        scale = rate_scale(str(text), record.output_unit)
+    except UnitError as error:
+        raise EstimateError(f"{said}a scale factor of {text} does not give that, {example} would") from error
+    output = record.signals["output"] / scale
     return record._replace(signals={**record.signals, "output": output}, output_unit="rad/s")
 
 

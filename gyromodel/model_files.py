@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import fields
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -17,9 +16,10 @@ from gyromodel._atomic import write_text
 from gyromodel._checks import thermometers
 from gyromodel.effects import Effect
 from gyromodel.effects.drivers import BiasColumn
-from gyromodel.estimate import Calibration, Estimate
+from gyromodel.estimate import Calibration, Estimate, validity_unit
 from gyromodel.model import GyroModel, ModelError, make_effect, parameter_unit
 from gyromodel.noise import NOISE_UNITS
+from gyromodel.numerics.uncertain import Uncertain
 from gyromodel.signals import Record
 from gyromodel.units import UnitError, convertible, factor, from_internal, internal_unit, quantity, to_internal
 
@@ -29,11 +29,6 @@ RECORD_KEYS = ("fit", "software")
 GAIN_UNITS = ("count/deg", "count/(deg/s)", "bit/deg", "bit/(deg/s)", "V/(deg/s)", "V/deg", "A/(deg/s)", "1/deg", "")
 FIT_KEYS = ("degrees_of_freedom", "validity", "data_hash", "covariance")
 SETTING_UNITS = {"reference": "degC", "full_rate": "deg/s", "lowest": "deg/s"}
-
-
-def validity_unit(name: str) -> str:
-    """Unit in which the range of a rate or a thermometer is written."""
-    return "deg/s" if name == "rate" else "degC"
 
 
 _NUMBER = re.compile(r"\s*[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?")
@@ -139,6 +134,8 @@ def read_calibration(path: str | Path) -> Calibration:
         validity[name] = (ends[0], ends[1])
     covariance = _read_covariance(fit["covariance"], parameter_names(model))
     degrees = fit["degrees_of_freedom"].number_in("")
+    if degrees < 0 or degrees != int(degrees):
+        raise fit["degrees_of_freedom"].error("degrees of freedom are a whole number, not below zero")
     return Calibration(model, covariance, validity, int(degrees), fit["data_hash"].text())
 
 
@@ -151,7 +148,12 @@ def _read_covariance(place: _Place, names: list[str]) -> np.ndarray:
     rows = [row.items("a row of the matrix") for row in found["matrix"].items("the matrix")]
     if any(len(row) != len(names) for row in [rows, *rows]):
         raise found["matrix"].error(f"the matrix needs {len(names)} rows of as many numbers")
-    return np.array([[entry.number_in("") for entry in row] for row in rows]).reshape(len(names), len(names))
+    matrix = np.array([[entry.number_in("") for entry in row] for row in rows]).reshape(len(names), len(names))
+    try:
+        Uncertain.stated(np.zeros(len(names)), matrix, "the matrix")
+    except ValueError as problem:
+        raise found["matrix"].error(str(problem)) from None
+    return matrix
 
 
 def _read(path: Path) -> tuple[GyroModel, dict[str, _Place]]:
@@ -212,7 +214,7 @@ def _read_effect(place: _Place) -> tuple[Effect, set[tuple[str, str]]]:
     except ModelError as problem:
         raise named.error(str(problem)) from None
     declared = effect.declared()
-    settings = [f.name for f in fields(effect) if f.name not in (*declared, "column", "unit")]
+    settings = effect.settings()
     found = place.mapping(("effect", "value", "fixed", "std", *declared, *settings), label)
     if "value" in found and len(declared) == 1:
         name, given = next(iter(declared)), found.pop("value")
@@ -335,7 +337,7 @@ def _document(model: GyroModel, estimate: Estimate | None) -> dict[str, Any]:
             entry[name] = _shown(values, unit)
             if known and len(known) == len(errors):
                 entry[name] = {"value": entry[name], "std": _shown(np.reshape(known, values.shape), unit)}
-        for name in (f.name for f in fields(effect) if f.name not in (*effect.declared(), "column", "unit")):
+        for name in effect.settings():
             value = getattr(effect, name)
             if isinstance(value, tuple) and not any(value):
                 continue

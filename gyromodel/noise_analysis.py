@@ -12,8 +12,8 @@ from gyromodel._checks import CampaignError
 from gyromodel.campaign import Campaign
 from gyromodel.noise import NOISE_UNITS as _STATED_UNITS
 from gyromodel.noise import Deviation, Estimator, IdentifiedNoise, deviation, identify_noise, with_gaps
-from gyromodel.signals import rate_output
-from gyromodel.units import UnitError, convertible, factor, internal_unit, quantity
+from gyromodel.signals import rate_output, rate_scale
+from gyromodel.units import UnitError, convertible, factor, internal_unit
 
 # A reference rate that changes by more (deg/s) is a test at speed.
 AT_REST = 0.01
@@ -59,7 +59,11 @@ class NoiseAnalysis:
 
     def unit_of(self, term: str) -> str:
         """Unit in which a coefficient is reported."""
-        return UNITS[term] if self.unit == RATE_UNIT else self.rate_unit + _BY_RATE[term]
+        if self.unit == RATE_UNIT:
+            return UNITS[term]
+        if term == "noise_quantisation" and self.rate_unit.endswith("/s"):
+            return self.rate_unit.removesuffix("/s")
+        return self.rate_unit + _BY_RATE[term]
 
     def scale_of(self, term: str) -> float:
         """What a coefficient is multiplied by to be in that unit."""
@@ -125,20 +129,26 @@ class NoiseAnalysis:
 
 
 def analyse_noise(campaign: Campaign, progress: Callable[[str, float], None] | None = None) -> NoiseAnalysis:
-    """Deviations and identified noise of a campaign at rest.
+    """Deviations and identified noise of a campaign at rest or at a constant rate.
 
     Args:
         campaign: one axis; increments and angles become rates first. Metadata `nominal_scale_factor`, such as
             `1000 count/deg`, turns raw outputs into rates; without it results are in the output's unit.
         progress: called with a line and the fraction done.
 
+    Returns:
+        Deviations and noise terms, with remarks on what they do not cover.
+
     Raises:
         CampaignError: the output shows no noise, or the campaign has several axes.
     """
     rate, unit = rate_output(campaign)
-    turned = np.ptp(campaign.in_unit("rate", "deg/s")) if "rate" in campaign.columns else 0.0
-    if turned > AT_REST:
-        raise CampaignError(f"{campaign.name}: column 'rate' changes by {turned:.3g} deg/s, but noise is read at rest")
+    turning = campaign.in_unit("rate", "deg/s") if "rate" in campaign.columns else np.zeros(1)
+    turning = turning[np.isfinite(turning)]
+    turned = np.ptp(turning) if len(turning) else np.nan
+    if not turned <= AT_REST:
+        found = f"changes by {turned:.3g} deg/s" if np.isfinite(turned) else "is not known"
+        raise CampaignError(f"{campaign.name}: column 'rate' {found}, but noise is read at a constant rate")
     time, remarks = campaign.si("time"), []
     if not convertible(unit, RATE_UNIT):
         nominal = _nominal(campaign, unit)
@@ -153,8 +163,9 @@ def analyse_noise(campaign: Campaign, progress: Callable[[str, float], None] | N
         noise = identify_noise(rate, time, progress=progress)
     except ValueError as error:
         raise CampaignError(f"{campaign.name}: {error}") from error
-    interval = float(np.median(np.diff(time)))
-    even = with_gaps(rate, time, np.arange(len(time)) == 0, interval)
+    known = np.isfinite(rate)
+    interval = float(np.median(np.diff(time[known])))
+    even = with_gaps(rate[known], time[known], interval)
     most = max(len(even) // 2, 1)
     lengths = np.unique(np.geomspace(1, most, int(LENGTHS_PER_DECADE * np.log10(most)) + 2).round().astype(int))
     deviations = {name: deviation(even, interval, name, lengths) for name in get_args(Estimator)}
@@ -178,10 +189,7 @@ def _nominal(campaign: Campaign, unit: str) -> float | None:
     if stated is None:
         return None
     try:
-        value, own = quantity(str(stated))
-        if not value:
-            raise UnitError("it is zero")
-        return value * factor(f"({own})*rad/s", unit)
+        return rate_scale(str(stated), unit)
     except UnitError as error:
         raise CampaignError(
             f"{campaign.name}: metadata nominal_scale_factor is '{stated}', expected the output over an angular rate, "

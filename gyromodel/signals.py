@@ -12,18 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from gyromodel._checks import CampaignError, thermometers
+from gyromodel._checks import MISSING_STEP, CampaignError, thermometers
 from gyromodel.campaign import Campaign
 from gyromodel.numerics.smoothing import smooth_derivative
 from gyromodel.numerics.state_space import Sampling
-from gyromodel.units import convertible, internal_unit
+from gyromodel.units import UnitError, convertible, factor, internal_unit, quantity
 
 # A step this many times the median one separates stretches of a record.
 GAP = 10.0
 # Longer records are padded less: the work outweighs the compiling.
 FINER_FROM = 4096
-# A step this many times the median one leaves out samples.
-INCREMENT_GAP = 1.5
 # A clock is regular if most steps differ by less than this part of the median one; the others are gaps.
 IRREGULAR, MOST_REGULAR = 0.01, 0.9
 # A column missing in more than this share of the rows is not searched; rows without one of the others are left out.
@@ -89,7 +87,21 @@ def rate_output(campaign: Campaign) -> tuple[np.ndarray, str]:
     if np.mean(np.abs(interval[1:] - typical) < IRREGULAR * typical) > MOST_REGULAR:
         interval[0] = typical
     # What was turned through during a gap is not known: the first increment behind one is missing.
-    return np.where(interval > INCREMENT_GAP * typical, np.nan, output / interval), f"{unit}/s"
+    return np.where(interval > MISSING_STEP * typical, np.nan, output / interval), f"{unit}/s"
+
+
+def rate_scale(stated: str, unit: str) -> float:
+    """A nominal scale factor as output per rad/s; counts may leave out "per second" on either side.
+
+    Raises:
+        UnitError: it is zero, or no output over an angular rate.
+    """
+    value, own = quantity(stated)
+    raw = unit.removesuffix("/s")
+    for form in (unit, raw, f"{raw}/s") if raw in ("count", "bit") else (unit,):
+        if value and convertible(f"({own})*rad/s", form):
+            return value * factor(f"({own})*rad/s", form)
+    raise UnitError(f"it is in [{own}]" if value else "it is zero")
 
 
 def _stretches(time: np.ndarray) -> np.ndarray:

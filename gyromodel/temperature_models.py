@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from itertools import combinations
+from itertools import product
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -27,8 +27,9 @@ Temperature = Uncertain | Float[Array | np.ndarray, " soak"]
 
 # A corner is rounded over this much, °C: no chamber holds a soak closer, and a sharp corner at one has no derivative.
 CORNER = 0.5
-# Places tried for a breakpoint between the outer soaks.
-PLACES = 121
+# Places tried for a breakpoint between the outer soaks, of one and of several, and how often its interval is looked at
+# more closely.
+PLACES, FEWER, ZOOMS = 121, 30, 4
 
 
 class Row(NamedTuple):
@@ -131,8 +132,11 @@ def fit_temperature_model(
     lines = [[np.polyfit(t[segment == s], y[segment == s], 1)[::-1] for s in range(segments)] for y in values]
     changes, breaks = np.zeros((len(values), count)), np.zeros((len(values), count))
     for i, y in enumerate(values if count else ()):
-        tried, misfit = _profile(t, y, np.eye(len(t)), count)
-        breaks[i] = tried[np.argmin(misfit)]
+        ordered = np.sort(t)
+        tried = _tried(t, [(ordered[1], ordered[-2])] * count)
+        if not len(tried):
+            raise EstimateError(f"{count} hinges do not fit between {len(t)} soaks: ask for fewer")
+        breaks[i] = tried[np.argmin(_misfits(t, y, np.eye(len(t)), tried))]
         solution = np.linalg.lstsq(_columns(t, breaks[i]), y, rcond=None)[0]
         lines[i], changes[i] = [solution[:2]], solution[2:]
     start = tuple(jnp.asarray(v) for v in (lines, changes, breaks))
@@ -165,16 +169,19 @@ def _columns(t: np.ndarray, breaks: np.ndarray) -> np.ndarray:
     return np.column_stack([np.ones(len(t)), t, *(_corner(t - b) for b in breaks)])
 
 
-def _profile(t: np.ndarray, y: np.ndarray, whitening: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sets of breakpoints between the outer soaks, and the least sum of squares with each."""
-    ordered = np.sort(t)
-    grid = np.linspace(ordered[1], ordered[-2], PLACES if count == 1 else PLACES // 4)
-    tried = np.array([b for b in combinations(grid, count) if (np.diff(b) > np.diff(ordered).max()).all()])
-    if not len(tried):
-        raise EstimateError(f"{count} hinges do not fit between {len(t)} soaks: ask for fewer")
+def _tried(t: np.ndarray, spans: list[tuple[float, float]]) -> np.ndarray:
+    """Sets of breakpoints, each on a grid over its span, a soak apart."""
+    grids = [np.linspace(low, high, PLACES if len(spans) == 1 else FEWER) for low, high in spans]
+    apart = np.diff(np.sort(t)).max()
+    sets = [b for b in product(*grids) if (np.diff(b) > apart).all()]
+    return np.reshape(sets, (-1, len(spans)))
+
+
+def _misfits(t: np.ndarray, y: np.ndarray, whitening: np.ndarray, tried: np.ndarray) -> np.ndarray:
+    """The least sum of squares with each set of breakpoints."""
     columns = [whitening @ _columns(t, b) for b in tried]
     y = whitening @ y
-    return tried, np.array([np.sum((y - c @ np.linalg.lstsq(c, y, rcond=None)[0]) ** 2) for c in columns])
+    return np.array([np.sum((y - c @ np.linalg.lstsq(c, y, rcond=None)[0]) ** 2) for c in columns])
 
 
 def _breakpoint_interval(fit: FunctionFit, t: np.ndarray, values: np.ndarray, given: Uncertain | None) -> np.ndarray:
@@ -190,9 +197,17 @@ def _breakpoint_interval(fit: FunctionFit, t: np.ndarray, values: np.ndarray, gi
     for i, y in enumerate(values if count else ()):
         covariance = fit.scatter[i] ** 2 * np.eye(len(t)) + slopes[i][:, None] * thermometry * slopes[i]
         whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-        tried, misfit = _profile(t, y, whitening, count)
-        kept = tried[misfit <= misfit.min() * (1 + fisher.ppf(0.95, 1, freedom) / freedom)]
-        interval[i] = np.stack([kept.min(axis=0), kept.max(axis=0)], axis=1)
+        ordered, best = np.sort(t), np.sort(fit.value[2][i])
+        spans = [(ordered[1], ordered[-2])] * count
+        for _ in range(ZOOMS):
+            tried = np.concatenate([best[None], _tried(t, spans)])
+            misfit = _misfits(t, y, whitening, tried)
+            kept = tried[misfit <= misfit.min() * (1 + fisher.ppf(0.95, 1, freedom) / freedom)]
+            # As far as the first place on either side that is rejected.
+            step = np.array([(high - low) / (PLACES if count == 1 else FEWER) for low, high in spans])
+            low, high = kept.min(axis=0) - step, kept.max(axis=0) + step
+            spans = list(zip(np.maximum(low, ordered[1]), np.minimum(high, ordered[-2]), strict=True))
+        interval[i] = spans
     return interval
 
 

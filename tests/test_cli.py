@@ -347,7 +347,7 @@ def test_noise_is_not_read_at_speed(tmp_path: Path, run: Run):
         f"# kind: rate\ntime [s],rate [deg/s],output [deg/s]\n{rows}", encoding="utf-8"
     )
     said = refusal(run("allan", tmp_path / "moving.csv", "-o", tmp_path / "out"))
-    assert "column 'rate' changes by 60 deg/s, but noise is read at rest" in said
+    assert "column 'rate' changes by 60 deg/s, but noise is read at a constant rate" in said
 
 
 def test_allan_writes_deviations_and_coefficients(bench: Path, run: Run):

@@ -5,6 +5,7 @@ are missing, and against published values: the ten- and the thousand-point sets 
 from __future__ import annotations
 
 import gzip
+import inspect
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -89,13 +90,13 @@ def by_definition(rate: np.ndarray, m: int, estimator: str) -> tuple[float, int]
 
 
 def total_by_definition(rate: np.ndarray, m: int) -> tuple[float, int]:
-    """Each stretch reflected at its ends, differences about its inner angles, all pooled."""
+    """Each stretch of two lengths reflected at its ends, differences about its inner angles, all pooled."""
     squares: list[float] = []
     for run in np.split(rate, np.flatnonzero(np.isnan(rate))):
         run = run[np.isfinite(run)]
         x = np.concatenate([[0.0], np.cumsum(run)])
         n = len(x)
-        if n - 1 <= m:
+        if n - 1 < 2 * m:
             continue
         before, after = 2 * x[0] - x[1:][::-1], 2 * x[-1] - x[:-1][::-1]
         y = np.concatenate([before, x, after])
@@ -173,6 +174,29 @@ def test_intervals_hold_the_true_deviation(gaps: bool, rng: np.random.Generator)
         inside.append(np.pad((found.low < truth) & (truth < found.high), (0, 4 - len(truth)), constant_values=True))
     for hits in np.sum(inside, axis=0):
         assert binom.cdf(hits, 200, 0.91) > RARE  # the noise is read off the slope, at times wrongly
+
+
+@pytest.mark.parametrize(("every", "lengths"), [(0, [16, 64, 256]), (40, [4, 8, 19])])
+def test_intervals_of_the_total_deviation_hold_under_a_random_walk(every: int, lengths: list[int], rng):
+    """Whose Allan variance at m samples is (2m² + 1)/6m; in one stretch, and in stretches of 39 samples."""
+    inside = np.zeros(3, int)
+    for _ in range(200):
+        rate = rng.standard_normal(512).cumsum()
+        if every:
+            rate[::every] = np.nan
+        found = deviation(rate, 1.0, "total", np.array([1, 2, *lengths]))
+        truth = np.sqrt((2.0 * found.length**2 + 1) / (6.0 * found.length))
+        inside += ((found.low < truth) & (truth < found.high))[2:]
+    for hits in inside:
+        assert binom.cdf(hits, 200, 0.90) > RARE  # the noise is read off the slope, at times wrongly
+
+
+def test_lengths_and_names_that_mean_nothing_are_refused():
+    unchecked = inspect.unwrap(deviation)  # as users call it, without the types that the tests check
+    with pytest.raises(ValueError, match="whole numbers"):
+        unchecked(np.arange(9.0), 1.0, lengths=np.array([1.5]))
+    with pytest.raises(ValueError, match="there is no alan deviation"):
+        unchecked(np.arange(9.0), 1.0, "alan")
 
 
 def test_dominant_noise_is_read_off_the_slope(rng: np.random.Generator):

@@ -289,3 +289,11 @@ def test_slope_is_the_derivative_by_rate() -> None:
         + (rate + 0.01) * (np.cos(0.4 * rate) / rate - np.sin(0.4 * rate) / (0.4 * rate**2))
     )
     assert np.asarray(model.slope(signals)) == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_compensated_output_is_no_driver(rng: np.random.Generator) -> None:
+    """What `compensate` adds to a campaign follows the output by construction."""
+    log = static_log(rng)
+    for name in ("rate_estimated", "rate_estimated_std"):
+        log = log.with_column(name, rng.uniform(1.0, 2.0, len(log)), "deg/s")
+    assert not any("rate_estimated" in name for name in build_bank(read_signals(log)).names())

@@ -231,6 +231,15 @@ def test_json_holds_all_that_the_model_is(fitted: Calibration, rng: np.random.Ge
     assert len(said["covariance"]["parameters"]) == 6
 
 
+def test_two_numbers_of_one_name_in_c_are_refused():
+    drivers = tuple(
+        BiasColumn(column=name, unit=f"deg/h/{unit}", coefficient=jnp.asarray(1e-3), reference=jnp.asarray(0.0))
+        for name, unit in (("coil a", "V"), ("coil_a", "Pa"))
+    )
+    with pytest.raises(ModelError, match="two numbers would be called bias_coil_a_coefficient in C"):
+        export_calibration(Calibration(GyroModel((SCALE, *drivers))), "c")
+
+
 def test_csv_has_a_row_for_each_number(fitted: Calibration):
     rows = list(csv.DictReader(io.StringIO(export_calibration(fitted, "csv"))))
     table = {(row.effect, row.name): row for row in fitted.table()}

@@ -449,6 +449,8 @@ def test_a_calibration_without_a_fit_has_no_covariance(tmp_path: Path):
         ("  data_hash: abc\n", "", 5, "fit lacks data_hash"),
         ("    unit: internal\n", "", 9, "a covariance lacks unit"),
         ("[[4.0e-12]]", "[[4.0e-12, 0]]", 11, "1 rows of as many numbers"),
+        ("[[4.0e-12]]", "[[-4.0e-12]]", 11, "a covariance is finite and symmetric"),
+        (": 7", ": -3.7", 5, "a whole number, not below zero"),
         ("[[4.0e-12]]", "[4.0e-12]", 11, "a row of the matrix as a list"),
         ("[[4.0e-12]]", "[[much]]", 11, "is no quantity"),
         ("[[4.0e-12]]", "[[4 deg]]", 11, "not in a plain number"),

@@ -10,7 +10,7 @@ from scipy.stats import binom
 
 from gyromodel.campaign import Campaign
 from gyromodel.files import read_campaign
-from gyromodel.noise import IdentifiedNoise, identify_noise
+from gyromodel.noise import IdentifiedNoise, deviation, identify_noise
 from gyromodel.noise import _reduced as reduction
 from gyromodel.noise._identify import KINDS
 from gyromodel.noise._lines import find_lines
@@ -231,6 +231,45 @@ def test_gaps_and_missing_samples_do_not_matter(fixed: np.random.Generator):
     found = identify_noise(rate, time)
     assert found.terms["noise_white"].low < N * 1.1
     assert found.terms["noise_white"].high > N * 0.9
+
+
+def test_lines_keep_their_size_across_gaps(fixed: np.random.Generator):
+    """Two parts so far apart that the phase is lost, and single samples missing, where it must be carried on."""
+    time = np.arange(2400) * STEP
+    line = 0.1 * np.cos(2 * np.pi * 0.3111 * time + 1.0)
+    rate = truth.white(2400, STEP, N, fixed) + line
+    apart = np.where(np.arange(2400) < 1200, time, time + 83_011.3)
+    sparse = np.where(fixed.random(2400) < 0.01, np.nan, rate)
+    for found in (identify_noise(rate, apart), identify_noise(sparse, time)):
+        ((frequency, amplitude, std, frequency_std),) = found.lines
+        assert abs(amplitude - 0.1) < 4.0 * std
+        assert abs(frequency - 0.3111) < 4.0 * frequency_std
+        assert found.terms["noise_white"].value == pytest.approx(N, rel=0.1)
+    # N √(2/T), of the longer part and of the whole.
+    assert identify_noise(rate, apart).lines[0].std == pytest.approx(N * np.sqrt(2 / 600), rel=0.1)
+    assert found.lines[0].std == pytest.approx(N * np.sqrt(2 / 1200), rel=0.1)
+
+
+@pytest.mark.parametrize(
+    "pattern", [np.arange(1200) % 3 == 0, np.arange(1200) % 60 < 4, np.arange(1200) % 2 == 0], ids=str
+)
+def test_sparse_records_are_read_at_their_own_pace(pattern: np.ndarray, fixed: np.random.Generator):
+    """Every second or third sample, or four a minute: noise of the same density, between sparser samples."""
+    rate = np.where(pattern, truth.white(1200, STEP, N, fixed), np.nan)
+    found = identified(rate)
+    step = np.median(np.diff(np.flatnonzero(pattern))) * STEP
+    assert found.terms["noise_white"].value == pytest.approx(N * np.sqrt(step / STEP), rel=0.2)
+
+
+def test_a_deviation_that_happens_to_be_zero_leads_nowhere():
+    """Whole counts whose halves have equal sums: the longest octave has one term, and that is zero."""
+    rng = np.random.default_rng(0)
+    rate = np.round(rng.standard_normal(512))
+    rate[256:] = rng.permutation(rate[:256])
+    assert deviation(rate, STEP).deviation[-1] == 0.0
+    found = identified(rate).terms["noise_white"]
+    assert found.value == pytest.approx(rate.std() * np.sqrt(STEP), rel=0.1)
+    assert found.low < found.value < found.high < 2 * found.value
 
 
 def test_what_no_kind_explains_is_said(fixed: np.random.Generator):

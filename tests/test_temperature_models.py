@@ -73,6 +73,20 @@ def test_intervals_of_breakpoints_cover(rng: np.random.Generator):
     assert inside >= binom.ppf(1e-5, count, 0.90)
 
 
+def test_a_sharp_bend_has_a_narrow_interval_that_covers(rng: np.random.Generator):
+    """Narrower than the soaks are apart by hundreds: an interval must not end with the grid that finds it."""
+    count, inside, widths = 20, 0, []
+    for _ in range(count):
+        y = 1.0 + 0.01 * SOAKS - 0.02 * np.maximum(SOAKS - 3.7, 0.0) + 1e-3 * rng.standard_normal(11)
+        model = fit_temperature_model({"SF": y}, SOAKS, "hinge")
+        low, high = model.breakpoint_interval[0, 0]
+        assert low < float(model.fit.value[2][0, 0]) < high
+        inside += low <= 3.7 <= high
+        widths.append(high - low)
+    assert inside >= binom.ppf(1e-5, count, 0.90)
+    assert np.median(widths) < 1.0
+
+
 def test_a_soak_at_the_split_keeps_its_side(rng: np.random.Generator):
     """Its temperature is uncertain by more than its distance from the split, and the two lines part there by far."""
     t = SOAKS + np.where(SOAKS == 0, 1e-4, 0.0)

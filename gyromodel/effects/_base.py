@@ -111,6 +111,11 @@ class Effect(eqx.Module):
         """Parameter declarations by field name."""
         return {f.name: f.metadata["parameter"] for f in fields(cls) if "parameter" in f.metadata}
 
+    @classmethod
+    def settings(cls) -> tuple[str, ...]:
+        """Fields that are neither parameters nor the column and unit of a driver."""
+        return tuple(f.name for f in fields(cls) if f.name not in (*cls.declared(), "column", "unit"))
+
     def settled(self) -> Self:
         """The form to fit once the search has chosen this one; fields in `held` are left as they are here."""
         return self

@@ -1,6 +1,6 @@
 """Joint generalised least squares with the noise estimated alongside; estimates carry their covariance."""
 
-from gyromodel.estimate._calibration import Calibration
+from gyromodel.estimate._calibration import Calibration, validity_unit
 from gyromodel.estimate._estimate import Estimate, EstimateError
 from gyromodel.estimate._fit import (
     check_covariates,
@@ -26,6 +26,7 @@ __all__ = [
     "fit_record",
     "make_filter",
     "two_stage",
+    "validity_unit",
     "whiten_columns",
     "with_noise_intervals",
 ]

@@ -13,6 +13,11 @@ from gyromodel.model import GyroModel, ModelError
 from gyromodel.units import factor, internal_unit
 
 
+def validity_unit(name: str) -> str:
+    """Unit in which the range of a rate or a thermometer is written."""
+    return "deg/s" if name == "rate" else "degC"
+
+
 class ParameterRow(NamedTuple):
     """One fitted parameter in its reporting unit."""
 

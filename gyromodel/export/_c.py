@@ -138,10 +138,13 @@ def _name(model: GyroModel, i: int, shown: str) -> str:
 
 def _constants(calibration: Calibration, reached: set[str]) -> list[str]:
     """The numbers that the model needs, in internal units; beside them those of the file."""
-    lines = []
+    lines, taken = [], set()
     for i, effect in enumerate(entries(calibration)):
         for entry in effect:
             name = _name(calibration.model, i, entry.name)
+            if name in reached and name in taken:
+                raise ModelError(f"two numbers would be called {name} in C; rename the columns of {entry.effect}")
+            taken.add(name)
             if name in reached:
                 spread = f" +/- {entry.std:.2g}" if entry.std > 0 else ""
                 comment = f"{entry.value:.10g}{spread} {entry.unit}".rstrip()

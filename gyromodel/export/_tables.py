@@ -7,7 +7,6 @@ import inspect
 import io
 import json
 import math
-from dataclasses import fields
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -15,8 +14,8 @@ import numpy as np
 from gyromodel import __version__
 from gyromodel._checks import usual_unit
 from gyromodel.effects.drivers import BiasColumn
-from gyromodel.estimate import Calibration
-from gyromodel.model_files import SETTING_UNITS, parameter_names, validity_unit
+from gyromodel.estimate import Calibration, validity_unit
+from gyromodel.model_files import SETTING_UNITS, parameter_names
 from gyromodel.noise import NOISE_UNITS
 from gyromodel.units import factor, from_internal, internal_unit
 
@@ -52,7 +51,7 @@ def entries(calibration: Calibration) -> list[list[Entry]]:
             for internal in np.ravel(getattr(effect, name)):
                 row = next(rows)
                 group.append(Entry(effect.label, kind, row.name, row.value, row.std, row.unit, float(internal)))
-        for name in (f.name for f in fields(effect) if f.name not in (*effect.declared(), "column", "unit")):
+        for name in effect.settings():
             unit = column_unit(effect) if isinstance(effect, BiasColumn) else SETTING_UNITS.get(name, "")
             values = np.ravel(getattr(effect, name))
             for shown, internal in zip(shown_names(name, len(values)), values, strict=True):

@@ -18,11 +18,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.stats import chi2
 
+from gyromodel._checks import MISSING_STEP
+
 Estimator = Literal["allan", "modified", "hadamard", "total"]
 
 # Order of the difference of the angle, and steps of the averaging length that one term spans.
 _ORDER: dict[str, int] = {"allan": 2, "modified": 2, "hadamard": 3, "total": 2}
-_STEPS: dict[str, int] = {"allan": 2, "modified": 3, "hadamard": 3, "total": 1}
+_STEPS: dict[str, int] = {"allan": 2, "modified": 3, "hadamard": 3, "total": 2}
 # Rows taken at a time, so that they stay in the nearest cache.
 _BLOCK = 2048
 _THREADS = 2
@@ -30,8 +32,9 @@ _THREADS = 2
 _EXPONENTS = np.array([2, 0, -1, -2])
 # Slopes of the variance that separate them; the modified variance falls faster under quantisation.
 _SLOPES = {False: (-1.5, -0.5, 0.5), True: (-2.0, -0.5, 0.5)}
-# Degrees of freedom of the total variance, b·T/τ − c: NIST SP 1065, section 5.4; quantisation as white noise.
-_TOTAL = {2: (1.5, 0.0), 0: (1.5, 0.0), -1: (1.17, 0.22), -2: (0.93, 0.36)}
+# Of the total variance: degrees of freedom b·T/τ − c, and expectation 1 − a·τ/T of the variance. NIST SP 1065, sections
+# 5.4 and 5.11; quantisation as white noise.
+_TOTAL = {2: (1.5, 0.0, 0.0), 0: (1.5, 0.0, 0.0), -1: (1.17, 0.22, 0.481), -2: (0.93, 0.36, 0.750)}
 # The degrees of freedom depend on the lengths by their ratio; this fine a grid, this many lengths of lag are enough.
 _GRID, _REACH = 16, 16
 
@@ -64,29 +67,39 @@ def deviation(
     """Overlapping Allan, modified Allan, overlapping Hadamard or total deviation of a rate.
 
     Only differences whose samples are all present count. The total deviation reflects each stretch between missing
-    samples at its own ends and pools the stretches that are longer than the averaging length.
+    samples at its own ends and pools the stretches of at least two averaging lengths; its limits, not its value, allow
+    for what it is too low by at long ones.
 
     Args:
         rate: equally spaced samples; NaN where one is missing. One NaN stands for a gap of any length.
         interval: time between samples (s).
         estimator: which deviation.
-        lengths: averaging lengths in samples; octaves by default. Lengths with no term are left out.
+        lengths: averaging lengths in whole samples; octaves by default. Lengths with no term are left out.
         confidence: of the interval. The dominant noise at each length is read off the local slope.
 
     Returns:
         The deviation at each averaging length.
 
+    Raises:
+        ValueError: there is no such estimator, or a length is no whole number.
+
     Source: NIST SP 1065, section 5.2; equation 25 for the total deviation.
     """
     rate = np.asarray(rate, np.float64)
+    if estimator not in _STEPS:
+        raise ValueError(f"there is no {estimator} deviation: choose {', '.join(_STEPS)}")
     if lengths is None:
         lengths = 2 ** np.arange(max(int(np.log2(max(len(rate), 1))), 1))
     lengths = np.asarray(lengths)
+    if (lengths != np.round(lengths)).any():
+        raise ValueError("averaging lengths are whole numbers of samples")
+    lengths = lengths.astype(int)
     lengths = lengths[(lengths > 0) & (lengths * _STEPS[estimator] <= len(rate))]
     record = _summed(rate, twice=estimator == "modified")
+    stretches = np.zeros((0, 2), int)
     if estimator == "total":
         angle = np.asarray(record.parts[0])[: len(rate) + 1]
-        breaks = np.flatnonzero(np.isnan(rate))  # a missing sample i lies between the angles i and i + 1
+        breaks = np.flatnonzero(~np.isfinite(rate))  # a missing sample i lies between the angles i and i + 1
         stretches = np.column_stack([np.concatenate([[0], breaks + 1]), np.concatenate([breaks, [len(rate)]])])
         work = partial(_total, record, angle, stretches)
     else:
@@ -100,12 +113,28 @@ def deviation(
     if estimator == "modified":
         variance /= lengths.astype(float) ** 2
     exponent = _dominant(variance, lengths, estimator)
-    freedom = np.array(
-        [_freedom(estimator, int(a), int(m), int(t)) for a, m, t in zip(exponent, lengths, terms, strict=True)]
-    )
+    if estimator == "total":
+        told = [_total_freedom(int(a), int(m), stretches) for a, m in zip(exponent, lengths, strict=True)]
+        freedom, share = np.reshape(told, (-1, 2)).T
+    else:
+        told = zip(exponent, lengths, terms, strict=True)
+        freedom, share = np.array([_freedom(estimator, int(a), int(m), int(t)) for a, m, t in told]), 1.0
     tail = (1.0 - confidence) / 2.0
-    low, high = (np.sqrt(variance * freedom / chi2.ppf(p, freedom)) for p in (1.0 - tail, tail))
+    low, high = (np.sqrt(variance / share * freedom / chi2.ppf(p, freedom)) for p in (1.0 - tail, tail))
     return Deviation(lengths * interval, np.sqrt(variance), low, high, lengths, terms, freedom, exponent)
+
+
+def with_gaps(
+    rate: Float[np.ndarray, " sample"], time: Float[np.ndarray, " sample"], interval: float
+) -> Float[np.ndarray, " row"]:
+    """The rate with one NaN where a step of time leaves out samples, as `deviation` takes it.
+
+    Args:
+        rate: in any unit.
+        time: of each sample (s), increasing.
+        interval: nominal time between samples (s).
+    """
+    return np.insert(rate, np.flatnonzero(np.diff(time) > MISSING_STEP * interval) + 1, np.nan)
 
 
 class _Record(NamedTuple):
@@ -125,7 +154,7 @@ def _summed(rate: np.ndarray, twice: bool) -> _Record:
     if np.isfinite(mean):
         np.subtract(rate, mean, out=angle[1 : n + 1])  # so that the angle stays small, and rounding errors with it
     else:
-        absent = np.isnan(rate)
+        absent = ~np.isfinite(rate)
         angle[1 : n + 1] = np.where(absent, 0.0, rate - rate[~absent].sum() / max(n - absent.sum(), 1))
         missing = np.zeros(len(angle), np.int32)
         np.cumsum(absent, out=missing[1 : n + 1])
@@ -183,8 +212,8 @@ def _sum_of_squares(record: _Record, m, order: int, overlap: int):
 
 def _total(record: _Record, angle: np.ndarray, stretches: np.ndarray, m: int) -> tuple[float, int]:
     """Second differences about every inner angle of each stretch, reflected at its ends."""
-    total = _differences(record, m, 2)[0] if len(angle) > 2 * m + 1 else 0.0
-    stretches = stretches[np.diff(stretches)[:, 0] > m]
+    stretches = stretches[np.diff(stretches)[:, 0] >= 2 * m]
+    total = _differences(record, m, 2)[0] if len(stretches) else 0.0
     if m > 1:
         total += sum(_reflected(angle[low : high + 1], m) for low, high in stretches)
     return total, int((np.diff(stretches)[:, 0] - 1).sum())
@@ -192,10 +221,6 @@ def _total(record: _Record, angle: np.ndarray, stretches: np.ndarray, m: int) ->
 
 def _reflected(angle: np.ndarray, m: int) -> float:
     """Sum of squared second differences about the angles that are nearer than m to an end of the stretch."""
-    if len(angle) <= 2 * m:
-        angle = np.concatenate([2 * angle[0] - angle[m:0:-1], angle, 2 * angle[-1] - angle[-2 : -m - 2 : -1]])
-        d = angle[2 * m + 1 : -1] - 2 * angle[m + 1 : -m - 1] + angle[1 : -2 * m - 1]
-        return float(np.einsum("i,i->", d, d))
     total = 0.0
     for side in (angle, angle[::-1]):
         d = 2 * side[0] - side[m - 1 : 0 : -1] - 2 * side[1:m] + side[m + 1 : 2 * m]
@@ -211,6 +236,15 @@ def _dominant(variance: np.ndarray, lengths: np.ndarray, estimator: Estimator) -
     exponent = _EXPONENTS[np.searchsorted(_SLOPES[estimator == "modified"], slope)]
     # Quantisation falls fastest: behind any other noise it cannot lead again.
     return np.where(np.logical_and.accumulate(exponent == 2), 2, np.minimum(exponent, 0))
+
+
+def _total_freedom(exponent: int, length: int, stretches: np.ndarray) -> tuple[float, float]:
+    """Degrees of freedom of the total variance pooled over stretches, and what part of the variance it expects."""
+    rows = np.diff(stretches)[:, 0]
+    rows = rows[rows >= 2 * length]
+    slope, less, short = _TOTAL[exponent]
+    share = np.average(1.0 - short * length / rows, weights=rows - 1)
+    return max(float(np.sum(slope * rows / length - less)), 1.0), float(share)
 
 
 @lru_cache
@@ -235,9 +269,6 @@ def _freedom(estimator: Estimator, exponent: int, length: int, terms: int) -> fl
 
     The terms are taken as one stretch: gaps only make them less dependent, so that the interval is on the safe side.
     """
-    if estimator == "total":
-        slope, less = _TOTAL[exponent]
-        return max(slope * terms / length - less, 1.0)
     spikes = exponent == 2 and estimator != "modified"  # correlated at whole lengths only
     m = 1 if spikes else min(length, _GRID)
     squares = _correlation(estimator, exponent, m) ** 2

@@ -7,36 +7,31 @@ others explains the record as well.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
-from itertools import product
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy.stats import chi2, gamma, norm
 from threadpoolctl import threadpool_limits
 
-from gyromodel.noise._deviation import Deviation, deviation
-from gyromodel.noise._fits import (
-    FLICKER,
-    MARKOV,
-    MARKOV_THRESHOLD,
-    THRESHOLD,
-    TIME_CONSTANT,
-    WHITE,
-    Fits,
-    Model,
-    Search,
+from gyromodel._checks import MISSING_STEP
+from gyromodel.noise._deviation import Deviation, deviation, with_gaps
+from gyromodel.noise._fits import FLICKER, LARGEST, MARKOV, SMALLEST, TIME_CONSTANT, WHITE, Fits, Model
+from gyromodel.noise._lines import (
+    HANN,
+    MOST_LINES,
+    Spectrum,
+    background,
+    find_lines,
+    line_columns,
+    refined_within,
+    spectrum,
 )
-from gyromodel.noise._lines import HANN, MOST_LINES, Spectrum, background, find_lines, line_columns, spectrum
 from gyromodel.noise._reduced import MOST_ROWS, Mixture, reduced
+from gyromodel.noise._terms import KINDS, TWO_SIDED, NoiseTerm, noise_terms
 
-Verdict = Literal["found", "ambiguous", "doubtful", "not identifiable"]
-
-KINDS = ("noise_white", "noise_quantisation", "noise_flicker", "noise_random_walk", "noise_markov")
-# Square root of twice the log likelihood ratio at the ends of a 95 % interval, and at a 95 % upper bound, which holds
-# even where slow noise shows in a single degree of freedom: χ²₁ < r, with r − 1 − ln r = 2.13², in 5 % of records.
-TWO_SIDED, BOUND = 1.960, 2.13
 # The same for a trend, which a random walk imitates: in 150 records each without a trend, at five sizes of the walk, it
 # exceeded 12 once.
 TREND = 12.0
@@ -45,12 +40,12 @@ TREND = 12.0
 FEWEST_IN_BIN, BINS, BY_CHANCE, MISFIT, APART = 24, 40, 1e-4, 1.25, 2.6
 FIRST_IN_BIN = 4
 FEWEST = 64
-# A step longer than this many intervals leaves out samples.
-GAP = 1.5
-# Lines slower than this many cycles a sample stay regressors where rows are grouped.
-SLOW_LINE = 1e-2
-# Half the 95 % point of chi-squared with one degree of freedom.
-BETTER = 1.92
+# Lines slower than this many cycles a sample stay regressors where rows are grouped, up to so many columns.
+SLOW_LINE, MOST_WAVES = 1e-2, 2 * MOST_LINES
+# Averaging times below this part of a time constant are short.
+SHORT = 1e-3
+# Averaging lengths whose deviation has fewer degrees of freedom give no first guess.
+FEWEST_FREE = 2.0
 # Allan variance times averaging length over its least so far, from which on the noise is redder than white.
 REDDER = 1.5
 # A kind whose absence costs this much needs no search without it.
@@ -58,31 +53,6 @@ CERTAIN = 50.0
 # All kinds but Markov noise; the same but white noise; the same but flicker.
 BROWN, NOT_WHITE = (True, True, True, True, False), (False, True, True, True, False)
 UNFLICKERING = (True, True, False, True, False)
-
-
-class NoiseTerm(NamedTuple):
-    """One kind of noise, in units of the rate and s.
-
-    `value` with its 95 % limits where `verdict` is found; where it is ambiguous, the size if it is this kind rather
-    than one of `alternatives`; where it is not identifiable, the record shows no more than the upper limit, at 95 %. Of
-    kinds that stand for one another only one is `in_model`. What would be found or ambiguous is doubtful where the
-    spectrum contradicts the model. A Markov process has its time constant (s) beside it; where there is none, `bounds`
-    are 95 % upper limits by time constant (s), for fast ones pass for white noise and slow ones for a random walk.
-    """
-
-    value: float
-    low: float
-    high: float
-    verdict: Verdict
-    in_model: bool
-    alternatives: tuple[str, ...] = ()
-    time_constant: float = float("nan")
-    bounds: tuple[tuple[float, float], ...] = ()
-
-    def scaled(self, unit: float) -> NoiseTerm:
-        """The same in another unit."""
-        bounds = tuple((constant, bound * unit) for constant, bound in self.bounds)
-        return self._replace(value=self.value * unit, low=self.low * unit, high=self.high * unit, bounds=bounds)
 
 
 class Line(NamedTuple):
@@ -140,21 +110,21 @@ class IdentifiedNoise(NamedTuple):
 
 def _markov_variance(q: float, constant: float, tau: np.ndarray) -> np.ndarray:
     x = tau / constant
-    return (q * constant) ** 2 / tau * (1.0 - (3.0 - 4.0 * np.exp(-x) + np.exp(-2.0 * x)) / (2.0 * x))
+    if_short = q**2 * tau / 3.0 * (1.0 - 0.75 * x)
+    whole = (q * constant) ** 2 / tau * (1.0 - (3.0 - 4.0 * np.exp(-x) + np.exp(-2.0 * x)) / (2.0 * x))
+    return np.where(x < SHORT, if_short, whole)  # the whole loses its digits there
 
 
 def identify_noise(
     rate: Float[np.ndarray, " sample"],
     time: Float[np.ndarray, " sample"],
-    restart: np.ndarray | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> IdentifiedNoise:
     """Identify the noise of a record at rest.
 
     Args:
-        rate: NaN where a sample is missing.
-        time: of each sample (s), increasing within each record; gaps are allowed.
-        restart: where independent records begin; the first row by default.
+        rate: in any unit, which is then that of the results; NaN where a sample is missing.
+        time: of each sample (s), increasing; gaps are allowed.
         progress: called with a line and the fraction done.
 
     Returns:
@@ -162,66 +132,74 @@ def identify_noise(
 
     Raises:
         ValueError: there are fewer than 64 samples, or they do not vary.
+
+    Source: IEEE Std 952-1997, annex C, for the kinds of noise.
     """
     rate, time = np.asarray(rate, float), np.asarray(time, float)
-    restart = np.arange(len(rate)) == 0 if restart is None else np.asarray(restart, bool)
     present = np.isfinite(rate)
-    if present.sum() < FEWEST or not np.ptp(rate[present]) > 0:
+    rate, time = rate[present], time[present]
+    if len(rate) < FEWEST or not np.ptp(rate) > 0:
         raise ValueError(
-            f"{int(present.sum())} samples{'' if present.sum() < FEWEST else ' of one value'} show no noise: "
-            f"at least {FEWEST} that vary are needed"
+            f"{len(rate)} samples{'' if len(rate) < FEWEST else ' of one value'} show no noise: at least {FEWEST} that "
+            "vary are needed"
         )
     tell = progress or (lambda text, share: None)
     with threadpool_limits(1, "blas"):
-        return _identify(rate, time, restart, present, tell)
+        return _identify(rate, time, tell)
 
 
-def _identify(rate, time, restart, present, tell) -> IdentifiedNoise:
-    steps = np.diff(time)[~restart[1:]]
-    interval, span = float(np.median(steps)), float(steps.sum())
-    scale = float(rate[present].std())
-    y = (rate - rate[present].mean()) / scale
-    clean = _longest(present & _regular(time, restart, interval))
+def _identify(rate: np.ndarray, time: np.ndarray, tell: Callable[[str, float], None]) -> IdentifiedNoise:
+    interval, span = float(np.median(np.diff(time))), float(time[-1] - time[0])
+    scale = float(rate.std())
+    y = (rate - rate.mean()) / scale
+    clean = _longest(time, MISSING_STEP * interval)
     tell("lines", 0.0)
     frequencies = np.asarray(find_lines(y[clean], time[clean], interval))
     more, frequencies = len(frequencies) > MOST_LINES, frequencies[:MOST_LINES]
-    bias = (np.cumsum(restart)[:, None] == np.arange(1, restart.sum() + 1)).astype(float)
-    waves = line_columns(frequencies, time)
-    sizes = np.linalg.lstsq(np.column_stack([bias, waves])[present], y[present], rcond=None)[0][bias.shape[1] :]
-    y = y - waves @ sizes
-    if present.sum() > MOST_ROWS:  # means of groups hold nothing of fast lines
-        waves = waves[:, np.repeat(frequencies < SLOW_LINE / interval, 2)]
-    seen = deviation(with_gaps(y, time, restart, interval), interval)
+    # Across a gap half as long as what shows a line, its phase is lost.
+    pieces = _pieces(time, 0.5 * float(time[clean][-1] - time[clean][0]))
+    main = next(p for p in pieces if p.start <= clean.start < p.stop)
+    frequencies = refined_within(y, time, frequencies, clean, main)
+    waves, amplitudes = np.zeros((len(y), 2 * len(frequencies) * len(pieces))), np.zeros(len(frequencies))
+    for k, piece in enumerate(pieces if len(frequencies) else ()):
+        columns = waves[piece, 2 * len(frequencies) * k :][:, : 2 * len(frequencies)]
+        columns[:] = line_columns(frequencies, time[piece])
+        sizes = np.linalg.lstsq(np.column_stack([columns, np.ones(len(columns))]), y[piece], rcond=None)[0][:-1]
+        y[piece] -= columns @ sizes
+        if piece == main:
+            amplitudes = np.hypot(*sizes.reshape(-1, 2).T)
+    slow = len(y) <= MOST_ROWS or frequencies < SLOW_LINE / interval  # means of groups hold nothing of fast lines
+    waves = waves[:, np.resize(np.repeat(np.broadcast_to(slow, len(frequencies)), 2), waves.shape[1])]
+    if waves.shape[1] > MOST_WAVES:
+        waves = waves[:, :0]
+    seen = deviation(with_gaps(y, time, interval), interval)
+    seen = Deviation(*(v[(seen.deviation > 0) & (seen.degrees_of_freedom >= FEWEST_FREE)] for v in seen))
     start, longest = _start(seen), _white_until(seen)
     tell("trend", 0.1)
-    trend = (time - time[present].mean()) / span
-    columns = np.column_stack([bias, waves])
+    trend = (time - time.mean()) / span
+    columns = np.column_stack([np.ones(len(y)), waves])
     level, tilted = (
-        Fits(reduced(time, y, x, restart, interval, longest), interval, span, start)
+        Fits(reduced(time, y, x, interval, longest), interval, span, start)
         for x in (columns, np.column_stack([columns, trend]))
     )
     ramp, slope = _ramp(level, tilted)
-    found = ramp.verdict == "found"
-    fits, y = (tilted, y - slope * trend) if found else (level, y)
+    fits, y = (tilted, y - slope * trend) if ramp.verdict == "found" else (level, y)
     tell("kinds of noise", 0.3)
     chosen = _choose(fits)
     tell("intervals", 0.6)
     units = (interval**0.5, interval, 1.0, 1.0, 1.0)
-    terms = {KINDS[k]: t.scaled(scale * units[k]) for k, t in _terms(fits, chosen).items()}
+    terms = {KINDS[k]: t.scaled(scale * units[k]) for k, t in noise_terms(fits, chosen).items()}
     terms["noise_rate_ramp"] = ramp.scaled(scale / span)
     power, noise = spectrum(y[clean], interval), fits.mixture(fits.found[chosen][0][None])
     misfits = _misfits(noise, power, interval)
-    around = np.interp(frequencies, power.frequency, background(power.power))
-    density = around if misfits else _density(noise, frequencies, interval)
-    amplitudes, errors = np.hypot(*sizes.reshape(-1, 2).T), np.sqrt(2.0 * density / (present.sum() * interval))
-    shifts = errors / (amplitudes * 2.0 * np.pi * time[present].std())
-    lines = zip(frequencies, amplitudes * scale, errors * scale, shifts, strict=True)
     if misfits or more:
-        terms |= {
-            k: t._replace(verdict="doubtful")
-            for k, t in terms.items()
-            if k in KINDS and t.verdict != "not identifiable"
-        }
+        terms = {k: t if t.verdict == "not identifiable" else t._replace(verdict="doubtful") for k, t in terms.items()}
+    density = _density(noise, frequencies, interval)
+    if misfits and len(frequencies):
+        density = np.interp(frequencies, power.frequency, background(power.power))
+    errors = np.sqrt(2.0 * density / (len(time[main]) * interval))
+    shifts = errors / (amplitudes * 2.0 * np.pi * time[main].std())
+    lines = zip(frequencies, amplitudes * scale, errors * scale, shifts, strict=True)
     tell("identified", 1.0)
     order = (*KINDS, "noise_rate_ramp")
     return IdentifiedNoise(
@@ -229,22 +207,15 @@ def _identify(rate, time, restart, present, tell) -> IdentifiedNoise:
     )
 
 
-def _longest(good: np.ndarray) -> slice:
-    """The longest stretch of rows that are all good."""
-    ends = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]])))
-    first, last = ends[::2], ends[1::2]
-    k = int(np.argmax(last - first))
-    return slice(int(first[k]), int(last[k]))
+def _pieces(time: np.ndarray, most: float) -> list[slice]:
+    """Rows between steps of time that are longer than `most`."""
+    ends = [0, *np.flatnonzero(np.diff(time) > most) + 1, len(time)]
+    return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
 
 
-def _regular(time: np.ndarray, restart: np.ndarray, interval: float) -> np.ndarray:
-    """Rows that follow the one before at the nominal interval."""
-    return ~restart & (np.diff(time, prepend=time[0]) < GAP * interval)
-
-
-def with_gaps(rate: np.ndarray, time: np.ndarray, restart: np.ndarray, interval: float) -> np.ndarray:
-    """The rate with one missing sample where time leaves a gap, as `deviation` takes it."""
-    return np.insert(rate, np.flatnonzero(~_regular(time, restart, interval))[1:], np.nan)
+def _longest(time: np.ndarray, most: float) -> slice:
+    """The piece with most rows."""
+    return max(_pieces(time, most), key=lambda piece: piece.stop - piece.start)
 
 
 def _white_until(seen: Deviation) -> int:
@@ -258,7 +229,8 @@ def _start(seen: Deviation) -> np.ndarray:
     """Parameters at which each kind by itself would reach half of the Allan variance where it comes nearest to it."""
     variance, m = seen.deviation**2, seen.length
     largest = [variance * m, variance * m**2 / 3.0, variance * np.pi / (2.0 * np.log(2.0)), 3.0 * variance / seen.tau]
-    return np.log(0.5 * np.array([*(x.min() for x in largest), largest[3].min(), 1.0]))
+    start = np.log(0.5 * np.array([*(x.min() for x in largest), largest[3].min(), 1.0]))
+    return np.clip(start, SMALLEST, LARGEST)
 
 
 def _ramp(level: Fits, tilted: Fits) -> tuple[NoiseTerm, float]:
@@ -279,7 +251,7 @@ def _ramp(level: Fits, tilted: Fits) -> tuple[NoiseTerm, float]:
 
 def _choose(fits: Fits) -> Model:
     """Fit all mixtures that may matter, and take the one whose kinds are all worth their price."""
-    subsets = [(*m, False) for m in product((False, True), repeat=4) if any(m)]
+    subsets = [(*m, False) for m in itertools.product((False, True), repeat=4) if any(m)]
     fits.fit([m for m in subsets if m[WHITE]] + [NOT_WHITE])
     if fits.found[BROWN][1] - fits.found[NOT_WHITE][1] < CERTAIN:
         fits.fit(subsets)
@@ -308,80 +280,6 @@ def _try_markov(fits: Fits, chosen: Model) -> None:
 
 def _flipped(model: Model, k: int) -> Model:
     return tuple(held != (i == k) for i, held in enumerate(model))
-
-
-def _terms(fits: Fits, chosen: Model) -> dict[int, NoiseTerm]:
-    """Value, interval and verdict of each kind, in units of the record and its sample interval."""
-    best = fits.best()
-    top = fits.found[best][1]
-    others: dict[int, list[Model]] = {}
-    peers: dict[int, Model] = {}  # the best model without, or with, each kind
-    for k in range(len(KINDS)):
-        # A Markov process of long time constant is a random walk: it rivals the others only where it does better.
-        rivals = [m for m, (_, value) in fits.found.items() if m[MARKOV] <= chosen[MARKOV] or value > top + BETTER]
-        others[k] = [m for m in (fits.found if k == MARKOV else rivals) if m[k] != chosen[k]]
-        if others[k]:
-            peers[k] = max(others[k], key=fits.penalised)
-    verdict: dict[int, Verdict] = {}
-    alternatives: dict[int, tuple[str, ...]] = {}
-    for k in range(len(KINDS)):
-        price = THRESHOLD if k < MARKOV else MARKOV_THRESHOLD
-        peer = peers.get(k)
-        gap = top - max((fits.found[m][1] for m in others[k]), default=-np.inf)
-        swapped = peer is not None and any(chosen[j] and not peer[j] for j in range(len(KINDS)))
-        near = peer is not None and 2.0 * (fits.penalised(best) - fits.penalised(peer)) < price
-        if chosen[k]:
-            verdict[k] = "found" if 2.0 * gap > price else "ambiguous"
-            alternatives[k] = tuple(KINDS[j] for j in range(5) if peer and peer[j] and not chosen[j])
-        else:
-            verdict[k] = "ambiguous" if swapped and near and k != MARKOV else "not identifiable"
-            alternatives[k] = tuple(KINDS[j] for j in range(5) if peer and chosen[j] and not peer[j])
-    union = tuple(verdict[k] != "not identifiable" for k in range(len(KINDS)))
-    fits.fit([union], [_joined(fits, chosen, peers, union)])
-    wider: dict[int, Model] = {k: tuple(u or i == k for i, u in enumerate(union)) for k in range(MARKOV)}
-    added = [m for k, m in wider.items() if not union[k]]
-    x = fits.found[union][0]
-    fits.fit(added, [np.where(np.isfinite(x), x, fits.start - 2.0)] * len(added))
-    searches = [Search(union, k, TWO_SIDED, up) for k in range(len(KINDS)) if union[k] for up in (False, True)]
-    searches += [Search(m, k, BOUND, True) for k, m in wider.items() if not union[k]]
-    ends = dict(zip([(s.parameter, s.up) for s in searches], fits.ends(searches), strict=True))
-    out: dict[int, NoiseTerm] = {}
-    for k in range(len(KINDS)):
-        if (k, True) not in ends:
-            constants = _time_constants(fits)
-            bounds = np.exp(0.5 * fits.markov_bounds(union, constants, BOUND))
-            told = tuple((float(c), float(b)) for c, b in zip(constants, bounds, strict=True))
-            out[k] = NoiseTerm(0.0, 0.0, float("inf"), "not identifiable", False, bounds=told)
-            continue
-        model = chosen if chosen[k] else peers[k] if union[k] else wider[k]
-        point = fits.found[model][0]
-        logs = np.array([point[k], ends.get((k, False), -np.inf), ends[k, True]])
-        value, low, high = (float(v) for v in np.exp(0.5 * logs))
-        low, high = min(low, value), max(high, value)  # they may come from different models
-        if verdict[k] == "found" and low == 0.0:
-            verdict[k] = "ambiguous"
-        said = alternatives[k] if verdict[k] == "ambiguous" else ()
-        constant = float(np.exp(point[TIME_CONSTANT])) if k == MARKOV else float("nan")
-        out[k] = NoiseTerm(value, low, high, verdict[k], chosen[k], said, constant)
-    return out
-
-
-def _time_constants(fits: Fits) -> np.ndarray:
-    """Powers of ten from ten intervals to a tenth of the record, or their middle if there is none."""
-    shortest, longest = 10.0 * fits.interval, 0.1 * fits.span
-    powers = 10.0 ** np.arange(np.ceil(np.log10(shortest)), np.floor(np.log10(longest)) + 1)
-    return powers if len(powers) else np.sqrt([shortest * longest])
-
-
-def _joined(fits: Fits, chosen: Model, peers: dict[int, Model], union: Model) -> np.ndarray:
-    """A start for the kinds of several models together."""
-    x = fits.found[chosen][0].copy()
-    for k, peer in peers.items():
-        if union[k] and not chosen[k]:
-            x[k] = fits.found[peer][0][k] - 1.0
-            if k == MARKOV:
-                x[TIME_CONSTANT] = fits.found[peer][0][TIME_CONSTANT]
-    return x
 
 
 def _density(noise: Mixture, frequency: np.ndarray, interval: float) -> np.ndarray:

@@ -85,6 +85,26 @@ def _refined(rate: np.ndarray, time: np.ndarray, frequency: float, resolution: f
     return frequency if abs(frequency - start) < resolution else start
 
 
+def refined_within(
+    rate: np.ndarray, time: np.ndarray, frequencies: np.ndarray, rows: slice, whole: slice
+) -> np.ndarray:
+    """Frequencies found on some rows, refined on ever wider stretches up to `whole`, each beside the others.
+
+    A stretch at most doubles, so that the phase stays known from one to the next.
+    """
+    first, last = rows.start, rows.stop
+    while len(frequencies) and (first, last) != (whole.start, whole.stop):
+        margin = 0.5 * (time[last - 1] - time[first])
+        first = max(int(np.searchsorted(time, time[first] - margin)), whole.start)
+        last = min(int(np.searchsorted(time, time[last - 1] + margin, "right")), whole.stop)
+        y, t = rate[first:last], time[first:last]
+        for j in range(len(frequencies)):
+            others = np.column_stack([line_columns(np.delete(frequencies, j), t), np.ones(len(t))])
+            left = y - others @ np.linalg.lstsq(others, y, rcond=None)[0]
+            frequencies[j] = _refined(left, t, frequencies[j], 1.0 / (t[-1] - t[0]))
+    return frequencies
+
+
 def line_columns(frequencies: np.ndarray, time: np.ndarray) -> np.ndarray:
     """Cosine and sine of each line."""
     phase = 2.0 * np.pi * np.outer(time, frequencies)

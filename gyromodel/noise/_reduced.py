@@ -14,6 +14,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from gyromodel._checks import MISSING_STEP
 from gyromodel.numerics.markov_cells import MarkovCells, Rows, log_determinant_and_gram
 
 # Rows that go through the filter as they are; sizes of groups where there are more.
@@ -109,11 +110,7 @@ class Reduced(NamedTuple):
 
     def _together(self, noise: Mixture, part: np.ndarray, states: slice) -> np.ndarray:
         """One batch of cells."""
-        phi = np.maximum(noise.correlation[states, part], 1e-300)
-        decay = np.concatenate([np.zeros((1, len(part))), -np.log(phi) / self.interval])
-        variance = np.concatenate([noise.walk[None, part] / self.interval, noise.variance[states, part]])
-        cells = MarkovCells(noise.white[part], noise.differenced[part], decay, variance)
-        log_v, gram = (np.asarray(x) for x in log_determinant_and_gram(cells, self.rows, self.columns))
+        log_v, gram = self._sums(noise, part, states)
         log_x, rss = _solved(np.moveaxis(gram, -1, 0))
         log_likelihood = -0.5 * (log_v + rss + (log_x if self.restricted else 0.0))
         return np.where(np.isfinite(log_likelihood) & (rss > 0), log_likelihood, -np.inf)
@@ -122,13 +119,18 @@ class Reduced(NamedTuple):
         """Coefficients of the regressors under the first noise, and their covariance."""
         for level in self.levels:
             noise = noise.averaged(level.contrasts.shape[1])
-        phi = np.maximum(noise.correlation[:, :1], 1e-300)
-        decay = np.concatenate([np.zeros((1, 1)), -np.log(phi) / self.interval])
-        variance = np.concatenate([noise.walk[None, :1] / self.interval, noise.variance[:, :1]])
-        cells = MarkovCells(noise.white[:1], noise.differenced[:1], decay, variance)
-        gram = np.asarray(log_determinant_and_gram(cells, self.rows, self.columns)[1])[..., 0]
+        gram = self._sums(noise, np.zeros(1, int), slice(None))[1][..., 0]
         covariance = np.linalg.inv(gram[:-1, :-1])
         return covariance @ gram[:-1, -1], covariance
+
+    def _sums(self, noise: Mixture, part: np.ndarray, states: slice) -> tuple[np.ndarray, np.ndarray]:
+        """ln |V| and XᵀV⁻¹X of some cells with some of their Markov processes."""
+        phi = np.maximum(noise.correlation[states, part], 1e-300)
+        decay = np.concatenate([np.zeros((1, len(part))), -np.log(phi) / self.interval])
+        variance = np.concatenate([noise.walk[None, part] / self.interval, noise.variance[states, part]])
+        cells = MarkovCells(noise.white[part], noise.differenced[part], decay, variance)
+        log_v, gram = log_determinant_and_gram(cells, self.rows, self.columns)
+        return np.asarray(log_v), np.asarray(gram)
 
 
 def _solved(gram: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -142,40 +144,35 @@ def _solved(gram: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.where(good, log_x, np.inf), rss
 
 
-def reduced(
-    time: np.ndarray, rate: np.ndarray, columns: np.ndarray, restart: np.ndarray, interval: float, longest: int
-) -> Reduced:
+def reduced(time: np.ndarray, rate: np.ndarray, columns: np.ndarray, interval: float, longest: int) -> Reduced:
     """Group a record until few enough rows are left.
 
     Args:
-        time: of each sample (s), increasing within each record.
-        rate: NaN where missing.
-        columns: regressors, which are fitted by least squares before deviations within groups are taken.
-        restart: where independent records begin.
+        time: of each sample (s), increasing.
+        rate: shape (sample,).
+        columns: regressors, shape (sample, regressor), fitted by least squares before deviations within groups are
+            taken.
         interval: nominal time between samples (s).
         longest: samples that a group may span: up to here the noise is no redder than white, and groups do not tell of
             one another. Records over TOO_MANY rows are grouped all the same, which is then an approximation.
     """
-    present = np.isfinite(rate)
-    data = np.column_stack([columns, np.where(present, rate, 0.0)])
-    # Samples follow on where a regular step leads to them from one that is there.
-    step = np.diff(time, prepend=time[0] - interval)
-    follows = ~restart & (step < 1.5 * interval) & np.concatenate([[False], present[:-1]]) & present
+    data = np.column_stack([columns, rate])
+    follows = np.diff(time, prepend=-np.inf) < MISSING_STEP * interval
     levels: list[Level] = []
     approximate = False
-    while (many := int(present.sum())) > MOST_ROWS:
+    while (many := len(data)) > MOST_ROWS:
         if longest < SMALLEST_GROUP and many <= TOO_MANY:
             break
         size = min(max(2 ** int(np.ceil(np.log2(many / MOST_ROWS))), SMALLEST_GROUP), LARGEST_GROUP)
         size = max(min(size, 2 ** int(np.log2(max(longest, 1)))), SMALLEST_GROUP)
-        stretch = np.cumsum(~follows)[present]
+        stretch = np.cumsum(~follows)
         order = np.arange(many) - np.searchsorted(stretch, stretch)
         first = np.flatnonzero(order % size == 0)
         first = first[first + size <= many]
         first = first[stretch[first + size - 1] == stretch[first]]
         if len(first) * size < WHOLE * many:
             break
-        index = np.flatnonzero(present)[first[:, None] + np.arange(size)]
+        index = first[:, None] + np.arange(size)
         groups = data[index]
         contrasts = _contrasts(size)
         x, y = groups[..., :-1], groups[..., -1]
@@ -183,10 +180,10 @@ def reduced(
         deviations = (y - x @ fitted) @ contrasts.T
         levels.append(Level(contrasts, len(first), deviations.T @ deviations))
         data, time = groups.mean(1), time[index[:, 0]]
-        restart = np.logical_or.reduceat(restart, np.concatenate([[0], index[1:, 0]]))
         follows = np.concatenate([[False], (index[1:, 0] == index[:-1, -1] + 1) & follows[index[1:, 0]]])
         approximate |= size > longest
-        interval, longest, present = interval * size, longest // size, np.ones(len(first), bool)
+        interval, longest = interval * size, longest // size
+    restart, present = np.arange(len(data)) == 0, np.ones(len(data), bool)
     rows = Rows(*(jnp.asarray(v) for v in (np.diff(time, prepend=time[0]), restart, follows, present)))
     return Reduced(tuple(levels), rows, data, interval, approximate)
 
