@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from gyromodel.compensation import compensate as compensate
     from gyromodel.diagnosis import Diagnosis as Diagnosis
     from gyromodel.diagnosis import diagnose as diagnose
+    from gyromodel.diagnosis import isolability as isolability
     from gyromodel.effects import CATALOGUE as CATALOGUE
     from gyromodel.effects import Effect as Effect
     from gyromodel.estimate import Calibration as Calibration
@@ -58,6 +59,7 @@ _MODULE_OF = {
     "export_calibration": "export",
     "fit": "estimate",
     "fit_function": "estimate",
+    "isolability": "diagnosis",
     "model_from_effects": "model",
     "read_calibration": "model_files",
     "read_campaign": "files",

@@ -205,6 +205,31 @@ def simulate(
 
 
 @app.command()
+def plan(
+    design: Annotated[Path, typer.Option(metavar="PLAN.yaml", help="What every column is to do.")],
+    model: Annotated[Path, typer.Option("--model", metavar="M.yaml", help="The simulation, its noise stated.")],
+    as_json: AsJson = False,
+) -> None:
+    """Tell which effects a planned campaign could show and tell apart, and which further test would help."""
+    from gyromodel.diagnosis import isolability
+    from gyromodel.model_files import read_model
+    from gyromodel.plan import read_plan
+    from gyromodel.report import isolability_rows, parted_words
+
+    found = isolability(read_plan(design), read_model(model))
+    if as_json:
+        print(_json(found.to_dict()), end="")
+        return
+    header = ("effect", "found from (80 %)", "hardest to tell from", "told apart from (95 %)", "unit")
+    _print_table(header, isolability_rows(found))
+    for name, reason in found.not_testable.items():
+        print(f"Not testable: {name} ({reason}).")
+    print("\nFurther tests, the most helpful first:")
+    for sentence, after in found.tests[:3]:
+        print(f"- {sentence} {parted_words(found, after)}")
+
+
+@app.command()
 def compensate(
     model: Annotated[Path, typer.Argument(metavar="M.yaml", help="A fitted model.")],
     campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Its output and what the model needs besides.")],

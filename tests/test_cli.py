@@ -186,6 +186,29 @@ def test_effects_as_json(run: Run):
     assert {"equation", "needs", "cause", "test", "parameters"} <= set(one)
 
 
+def test_plan_tells_what_could_be_told_apart(tmp_path: Path, run: Run):
+    """One ramp: temperature and time are one line, which the table, the tests and the JSON form all say."""
+    (tmp_path / "plan.yaml").write_text(
+        "gyro: fog\nkind: rate\nduration: 1 h\ninterval: 20 s\noutput: deg/h\n"
+        "columns:\n  temperature: [{for: 1 h, from: 20 degC, to: 60 degC}]\n",
+        encoding="utf-8",
+    )
+    (tmp_path / "model.yaml").write_text(
+        "effects:\n  - effect: bias\nnoise:\n  - {effect: noise_white, value: 0.005 deg/sqrt(h)}\n", encoding="utf-8"
+    )
+    told = run("plan", "--design", tmp_path / "plan.yaml", "--model", tmp_path / "model.yaml")
+    assert told.status == 0, told.err
+    row = next(line.split() for line in told.out.splitlines() if line.startswith("bias_temperature "))
+    assert row[2] == "bias_drift"
+    assert "Not testable: scale_factor (needs a column rate)." in told.out
+    first = told.out.split("the most helpful first:\n")[1].splitlines()[0]
+    assert "temperature" in first
+    assert "bias_temperature at" in first
+    listed = run("plan", "--design", tmp_path / "plan.yaml", "--model", tmp_path / "model.yaml", "--json")
+    sizes = {(a["effect"], a["from"]): a["size"] for a in json.loads(listed.out)["apart"]}
+    assert sizes["bias_temperature", "bias_drift"] is None or sizes["bias_temperature", "bias_drift"] > 100
+
+
 def test_simulate_repeats_with_its_seed_and_differs_without(bench: Path, run: Run):
     def simulated(seed: int, name: str) -> bytes:
         made = run(

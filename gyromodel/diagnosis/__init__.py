@@ -1,6 +1,8 @@
 """What a simulation gets wrong: evidence, unknown drivers, extension, held-out gain and verdict."""
 
-from gyromodel.diagnosis._diagnose import SAFE_THRESHOLD, diagnose
+from gyromodel.diagnosis._diagnose import diagnose
+from gyromodel.diagnosis._evidence import SAFE_THRESHOLD
+from gyromodel.diagnosis._isolation import Isolability, Size, isolability
 from gyromodel.diagnosis._result import (
     Candidate,
     Cause,
@@ -21,8 +23,11 @@ __all__ = [
     "Diagnosis",
     "Driver",
     "Gain",
+    "Isolability",
     "ParameterValue",
     "Round",
+    "Size",
     "Verdict",
     "diagnose",
+    "isolability",
 ]

@@ -13,7 +13,9 @@ from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._average import average
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores
+from gyromodel.diagnosis._evidence import SAFE_THRESHOLD
 from gyromodel.diagnosis._gain import ladder_error, nested_gain, no_gain, not_measured
+from gyromodel.diagnosis._isolation import settling_test
 from gyromodel.diagnosis._ranking import Ranking, cells_of_weight, is_driver, is_noise
 from gyromodel.diagnosis._result import Candidate, Diagnosis, Gain, Round
 from gyromodel.diagnosis._scan import Scanner
@@ -27,8 +29,6 @@ from gyromodel.noise import NoiseGrid, NoiseRatios, noise_grid
 from gyromodel.signals import Record, read_signals, with_columns_known
 from gyromodel.units import convertible, factor, from_internal
 
-# ln of the evidence ratio that noise alone exceeds less than once in a hundred campaigns; see benchmarks/threshold.py.
-SAFE_THRESHOLD = 4.0
 FEWEST_DRAWS = 200
 # Folds search the noise cells within this many nats of the best of the main pass.
 FOLD_NEARBY = 3.0
@@ -136,6 +136,10 @@ def diagnose(
             "do."
         )
     judgement = judge(record, session.scanner, baseline, selection, extended, len(bank.names()), nulls)
+    next_test = judgement.next_test
+    if judgement.verdict == "ambiguous":
+        measured = [c for c, _ in shortened]
+        next_test = settling_test(measured, baseline.model, extended, list(judgement.credible_set)) or next_test
     gain = not_measured(unit) if not hold_out else _gain(session, baseline, selection, unit, scale, weights, say)
     driver = driver_shape(session.scanner, selection, judgement.driver, unit) if judgement.driver else None
     say("done", 1.0)
@@ -151,7 +155,7 @@ def diagnose(
         causes=judgement.causes,
         driver=driver,
         gain=gain,
-        next_test=judgement.next_test,
+        next_test=next_test,
         minimum_detectable=minimum_detectable(session.scanner, selection.last, session.threshold, unit),
         not_testable=bank.not_testable | not_testable(session.scanner, selection.last, selection.estimate.model),
         noise=extended.noise_table(),

@@ -22,14 +22,14 @@ def maximise(
     """Local maxima over the free parameters of each problem.
 
     Args:
-        function: values of many points at once, shape (point, parameter); −inf where undefined.
+        function: from points, shape (point, parameter), to their values, shape (point,); −inf where undefined.
         start: first guesses, shape (problem, parameter).
         free: which parameters may move, same shape; the others stay, also where they are −inf.
-        low: bounds of each parameter.
-        high: bounds of each parameter.
+        low: lower bound of each parameter, shape (parameter,).
+        high: upper bound of each parameter, shape (parameter,).
 
     Returns:
-        The maxima, shape (problem, parameter), and their values.
+        The maxima, shape (problem, parameter), and their values, shape (problem,).
     """
     best, value = start.copy(), np.full(len(start), -np.inf)
     trial, move = start.copy(), np.zeros_like(start)

@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
+from gyromodel.report._isolation import isolability_rows, parted_words
 from gyromodel.report._numbers import with_uncertainty
 from gyromodel.report._page import write_report
 from gyromodel.report._sentence import sentence
@@ -9,7 +10,15 @@ from gyromodel.report._sentence import sentence
 if TYPE_CHECKING:
     from gyromodel.report._deviation import deviation_figure, noise_rows
 
-__all__ = ["deviation_figure", "noise_rows", "sentence", "with_uncertainty", "write_report"]
+__all__ = [
+    "deviation_figure",
+    "isolability_rows",
+    "noise_rows",
+    "parted_words",
+    "sentence",
+    "with_uncertainty",
+    "write_report",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,0 +1,99 @@
+"""Further measurements that a campaign could be followed by: the same campaign again with one thing done otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from gyromodel._checks import thermometers
+from gyromodel.campaign import Campaign
+from gyromodel.units import from_internal
+
+# Columns that a test cannot step by themselves.
+NOT_SET = ("segment", "run", "position", "rate", "rate_spin", "rate_output", "azimuth")
+# How many times as fast the temperature is cycled, and how often up and down at least.
+FASTER, CYCLES = 4, 2
+# Levels of a column that is stepped up and down, and delays tried between two thermometers as parts of the record.
+LEVELS, DELAYS = 5, np.linspace(0.0, 0.1, 41)
+
+
+class AddedTest(NamedTuple):
+    """What to do, as a sentence, and the campaign to come; its output is that of the campaign it follows."""
+
+    sentence: str
+    campaign: Campaign
+
+
+def added_tests(campaign: Campaign) -> Iterator[AddedTest]:
+    """Tests as long as a campaign, each of which changes one thing that the campaign has a column for."""
+    yield AddedTest("Repeat the run.", campaign)
+    if "temperature" in campaign.columns and np.ptp(campaign.columns["temperature"]) > 0:
+        yield from _thermal(campaign)
+    if "rate" in campaign.columns and np.ptp(campaign.columns["rate"]) > 0:
+        rate = campaign.columns["rate"]
+        yield AddedTest("Run the same rates with their signs reversed.", _with(campaign, rate=-rate))
+        yield AddedTest("Run the same rates in the opposite order.", _with(campaign, rate=rate[::-1]))
+    if "azimuth" in campaign.columns:
+        turned = campaign.columns["azimuth"] + from_internal(np.pi / 2, campaign.units["azimuth"])
+        yield AddedTest("Turn the gyro by 90° in azimuth and repeat.", _with(campaign, azimuth=turned))
+    for name in campaign.covariates:
+        if name in (*NOT_SET, *thermometers(campaign.columns)) or not np.ptp(campaign.columns[name]) > 0:
+            continue
+        still = {
+            other: np.full(len(campaign), np.median(campaign.columns[other]))
+            for other in campaign.covariates
+            if other not in NOT_SET
+        }
+        stepped = still | {name: _staircase(campaign.columns[name])}
+        yield AddedTest(f"Step {name} up and down between its extremes, all else held.", _with(campaign, **stepped))
+
+
+def _thermal(campaign: Campaign) -> Iterator[AddedTest]:
+    """Other histories of temperature; further thermometers follow the first as they do in the campaign."""
+    time, values = campaign.si("time"), campaign.columns["temperature"]
+    low, high, unit = values.min(), values.max(), campaign.units["temperature"]
+    part = (time - time[0]) / np.ptp(time)
+    speed = np.quantile(np.abs(np.gradient(values, time)), 0.9)
+    cycles = max(round(FASTER * speed * np.ptp(time) / (2.0 * (high - low))), CYCLES)
+    between = f"between {low:.3g} and {high:.3g} {unit}"
+    middle = float(np.median(values))
+    # From where the campaign begins.
+    start = float(values[0] > 0.5 * (low + high))
+    triangle = np.abs((2.0 * cycles * part + start + 1.0) % 2.0 - 1.0)
+    once = np.abs((2.0 * part + start + 1.0) % 2.0 - 1.0)
+    square = (np.floor(2.0 * cycles * part) + start) % 2.0
+    histories = {
+        "Run the temperature history backwards.": values[::-1],
+        f"Hold the temperature at {middle:.3g} {unit}.": np.full(len(values), middle),
+        f"Ramp the temperature up and down {cycles} times {between}.": low + (high - low) * (1.0 - triangle),
+        f"Ramp the temperature up and down once {between}.": low + (high - low) * (1.0 - once),
+        f"Step the temperature to and fro {cycles} times {between}.": low + (high - low) * square,
+    }
+    for sentence, history in histories.items():
+        others = {
+            name: _followed(time, values, campaign.columns[name], history)
+            for name in thermometers(campaign.columns)
+            if name != "temperature"
+        }
+        yield AddedTest(sentence, _with(campaign, temperature=history, **others))
+
+
+def _with(campaign: Campaign, **columns: np.ndarray) -> Campaign:
+    for name, values in columns.items():
+        campaign = campaign.with_column(name, values, campaign.units[name])
+    return campaign
+
+
+def _staircase(values: np.ndarray) -> np.ndarray:
+    """Up and down again in steps between the extremes."""
+    levels = np.concatenate([np.arange(LEVELS), np.arange(LEVELS)[::-1]]) / (LEVELS - 1)
+    return values.min() + np.ptp(values) * levels[np.arange(len(values)) * len(levels) // len(values)]
+
+
+def _followed(time: np.ndarray, first: np.ndarray, second: np.ndarray, history: np.ndarray) -> np.ndarray:
+    """A second thermometer under another history: the first, delayed and offset as it fits the campaign best."""
+    delayed = [np.interp(time - part * np.ptp(time), time, first) for part in DELAYS]
+    best = int(np.argmin([np.var(second - x) for x in delayed]))
+    return np.interp(time - DELAYS[best] * np.ptp(time), time, history) + np.mean(second - delayed[best])

@@ -1,0 +1,299 @@
+"""How far apart effects lie on a campaign, before or after it is measured, and which further test would part them."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from gyromodel.campaign import Campaign
+from gyromodel.diagnosis._added_tests import added_tests
+from gyromodel.diagnosis._bank import build_bank
+from gyromodel.diagnosis._evidence import SAFE_THRESHOLD, explained_for
+from gyromodel.diagnosis._ranking import skipped
+from gyromodel.effects import Effect, Signals
+from gyromodel.effects.drivers import BiasStep
+from gyromodel.estimate import Estimate, filter_of, given_ratios, whiten_columns
+from gyromodel.model import GyroModel, ModelError, make_effect, parameter_unit
+from gyromodel.noise import NoiseRatios
+from gyromodel.signals import Record, read_signals, with_columns_known
+from gyromodel.units import factor, internal_unit
+
+# Two signals this many standard deviations apart are taken for one another in 5 % of campaigns: Φ(−d/2).
+APART = 3.29
+# Added to the size that just reaches the threshold, so that noise leaves it there with 80 %.
+POWER = 0.84
+# Times of a step that stand for all, and the share of a signal that the model must leave.
+STEPS, VANISHED = 25, 1e-6
+# A test is worth asking for if it brings two effects this many times as far apart; repeating all gives 1.4. More than
+# MOST counts no more.
+WORTHWHILE, MOST = 1.5, 100.0
+
+
+class View:
+    """A record as noise lets it be seen: signals whitened, in standard deviations, less what a model takes."""
+
+    def __init__(self, record: Record, model: GyroModel, ratios: NoiseRatios, std: float) -> None:
+        self.record, self.model, self._std = record, model, std
+        self._filter = filter_of(record, ratios)
+        self._taken = _basis(self._whitened(np.asarray(model.linearise(record.signals)[1])))
+
+    def _whitened(self, columns: np.ndarray) -> np.ndarray:
+        padded = jnp.asarray(np.pad(columns, ((0, 0), (0, -columns.shape[1] % 16))))
+        whitened = np.asarray(whiten_columns(self._filter, padded))[: self.record.rows, : columns.shape[1]]
+        return whitened[self.record.present] / self._std
+
+    def rest(self, columns: np.ndarray) -> np.ndarray:
+        """What is left of columns in output units."""
+        whitened = self._whitened(columns)
+        return whitened - self._taken @ (self._taken.T @ whitened)
+
+    def columns_of(self, effects: Sequence[Effect], *, whole: bool = False) -> list[np.ndarray]:
+        """What is left of the columns of each effect; or all of them."""
+        each = [np.asarray(self.model.columns_of(e, self.record.signals)) for e in effects]
+        ends = np.cumsum([c.shape[1] for c in each])[:-1]
+        columns = np.concatenate(each, axis=1)
+        return np.split(self._whitened(columns) if whole else self.rest(columns), ends, axis=1)
+
+
+def _basis(columns: np.ndarray) -> np.ndarray:
+    """Orthonormal columns of the same span."""
+    norm = np.linalg.norm(columns, axis=0)
+    columns = columns[:, norm > 0] / norm[norm > 0]
+    u, s, _ = np.linalg.svd(columns, full_matrices=False)
+    return u[:, s > 1e-6 * s.max(initial=0.0)]
+
+
+def _forms(effect: Effect, signals: Signals) -> list[Effect]:
+    """All forms of an effect that a search would try on some signals; itself if it has no others."""
+    return (list(type(effect).candidates(signals)) if effect.label == effect.id else []) or [effect]
+
+
+def nearest(view: View, truths: Sequence[Effect]) -> tuple[float, str, str]:
+    """The least distance of one of the effects, as it is, from the best form of another, and the names of the two.
+
+    In standard deviations; pairs of which one contains the other are left out.
+    """
+    signals = view.record.signals
+    found = [(np.inf, "", "")]
+    left = [c @ np.asarray(e.linear()) for c, e in zip(view.columns_of(truths), truths, strict=True)]
+    for rival in truths:
+        bases = [_basis(c) for c in view.columns_of(_forms(rival, signals))]
+        for truth, signal in zip(truths, left, strict=True):
+            if truth is rival or truth.label in rival.supersedes or rival.label in truth.supersedes:
+                continue
+            distance = min(float(np.linalg.norm(signal - b @ (b.T @ signal))) for b in bases)
+            found.append((distance, truth.label, rival.label))
+    return min(found)
+
+
+def settling_test(
+    campaigns: Sequence[Campaign], baseline: GyroModel, extended: Estimate, names: Sequence[str]
+) -> str | None:
+    """The further test that best parts effects which stand for one another, in words; None if none known helps.
+
+    Args:
+        campaigns: what was measured.
+        baseline: the simulation.
+        extended: the fit with one of the effects.
+        names: the effects; gross errors and noise among them are left out.
+    """
+    names = [name for name in names if name != "outliers" and not name.startswith("noise_")]
+    first = next((name for name in names if name in extended.model.labels), None)
+    if first is None or len(names) < 2:
+        return None
+    without = extended.model.without(first)
+    for effect in baseline.effects:
+        if effect.label not in (*without.labels, first):
+            without = without.with_effect(effect)
+    std = float(np.sqrt(extended.white_variance))
+    truths = _at_size(View(extended.record, without, extended.ratios, std), extended.model, names)
+
+    def distance(*more: Campaign) -> tuple[float, str, str]:
+        record = with_columns_known(read_signals([*campaigns, *more]))[0]
+        return nearest(View(record, without, extended.ratios, std), truths)
+
+    now = distance()[0]
+    tried = [(*distance(_output_known(test.campaign, 1)), test.sentence) for test in added_tests(campaigns[-1])]
+    reached, *closest, sentence = max(tried, key=lambda t: t[0])
+    if not reached > WORTHWHILE * now:
+        return None
+    again = "" if reached >= APART else f" Do it {int(np.ceil((APART / reached) ** 2))} times."
+    return (
+        f"{sentence} {' and '.join(sorted(closest))} would then lie {reached:.1f} standard deviations apart instead of "
+        f"{now:.1f}; {APART:.1f} tell them apart with 95 %.{again}"
+    )
+
+
+def _at_size(view: View, fitted: GyroModel, names: Sequence[str]) -> list[Effect]:
+    """Each effect at the size it has if it is the cause: as fitted, or its form that explains most."""
+    signals, found = view.record.signals, []
+    residual = view.rest(np.asarray(signals["output"] - view.model.predict(signals))[:, None])[:, 0]
+    for name in names:
+        if name in fitted.labels:
+            found.append(fitted.effects[fitted.labels.index(name)])
+            continue
+        tried = []
+        forms = _forms(make_effect(name).prepared(signals), signals)
+        for form, columns in zip(forms, view.columns_of(forms), strict=True):
+            coefficients, *_ = np.linalg.lstsq(columns, residual, rcond=1e-9)
+            tried.append((float(np.sum((residual - columns @ coefficients) ** 2)), form, coefficients))
+        _, form, coefficients = min(tried, key=lambda t: t[0])
+        found.append(form.with_linear(jnp.asarray(coefficients)))
+    return found
+
+
+def _output_known(campaign: Campaign, number: int = 0) -> Campaign:
+    """The campaign with an output at each sample: only that it is there matters, and that no other has the same."""
+    name = campaign.outputs[0]
+    return campaign.with_column(name, np.arange(len(campaign), dtype=float) + number, campaign.units[name])
+
+
+class Size(NamedTuple):
+    """A size of an effect: of its first parameter, in that parameter's unit."""
+
+    value: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Isolability:
+    """What a campaign can show.
+
+    Attributes:
+        detectable: least size of each effect that is found with 80 %, were it alone.
+        apart: by two effects, the size of the first from which it is told from the second with 95 %; infinite where it
+            never is.
+        not_testable: effects that the campaign does not show, with the reason.
+        tests: further tests, the most helpful first, each with `apart` as it is after it.
+    """
+
+    detectable: Mapping[str, Size]
+    apart: Mapping[tuple[str, str], Size]
+    not_testable: Mapping[str, str]
+    tests: tuple[tuple[str, Mapping[tuple[str, str], Size]], ...]
+
+    def closest(self, effect: str, apart: Mapping[tuple[str, str], Size] | None = None) -> tuple[str, Size] | None:
+        """The effect that is hardest to tell from this one, and the size from which that is done; after a test too."""
+        rivals = {b: size for (a, b), size in (self.apart if apart is None else apart).items() if a == effect}
+        return max(rivals.items(), key=lambda item: item[1].value) if rivals else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain data; a size that is never reached is null."""
+
+        def plain(size: Size) -> dict[str, Any]:
+            return {"size": size.value if np.isfinite(size.value) else None, "unit": size.unit}
+
+        def pairs(sizes: Mapping[tuple[str, str], Size]) -> list[dict[str, Any]]:
+            return [{"effect": a, "from": b, **plain(size)} for (a, b), size in sizes.items()]
+
+        return {
+            "minimum_detectable": {name: plain(size) for name, size in self.detectable.items()},
+            "apart": pairs(self.apart),
+            "not_testable": dict(self.not_testable),
+            "tests": [{"test": sentence, "apart": pairs(sizes)} for sentence, sizes in self.tests],
+        }
+
+
+def isolability(
+    campaign: Campaign, model: GyroModel, threshold: float = SAFE_THRESHOLD, *, tests: bool = True
+) -> Isolability:
+    """Which effects a campaign could show and tell apart, at what size, before any output is measured.
+
+    Args:
+        campaign: its columns; the output is not used.
+        model: what the simulation contains, with its noise stated.
+        threshold: least ln evidence ratio of a finding.
+        tests: whether further tests are tried.
+
+    Raises:
+        ModelError: the model states no noise, or a scale factor without a value.
+    """
+    if not model.noise:
+        raise ModelError("what can be told apart depends on the noise: state noise_white and the rest in the model")
+    if not np.isfinite(float(model.gain())):
+        raise ModelError("what can be told apart depends on the scale factor: state its value in the model")
+    campaign = _output_known(campaign)
+    detectable, before, not_testable = _sizes([campaign], model, threshold)
+    # Pairs that are not told apart at the size that shows them are what a further test is for.
+    in_doubt = [(a, b) for (a, b), size in before.items() if size.value > detectable[a].value]
+    helped = []
+    for test in added_tests(campaign) if tests else ():
+        after = _sizes([campaign, _output_known(test.campaign, 1)], model, threshold)[1]
+        gained = sum(_nats(before[pair], after[pair]) for pair in in_doubt if pair in after)
+        helped.append((gained, test.sentence, after))
+    helped.sort(key=lambda item: -item[0])
+    return Isolability(detectable, before, not_testable, tuple((sentence, after) for _, sentence, after in helped))
+
+
+def _nats(before: Size, after: Size) -> float:
+    """What a test gains for a pair; of one that was never told apart, as much as counts."""
+    return float(np.log(min(before.value / after.value, MOST))) if np.isfinite(after.value) else 0.0
+
+
+def _sizes(
+    campaigns: Sequence[Campaign], model: GyroModel, threshold: float
+) -> tuple[dict[str, Size], dict[tuple[str, str], Size], dict[str, str]]:
+    """Sizes that are found, sizes that are told apart, and what is not testable."""
+    record = with_columns_known(read_signals(campaigns))[0]
+    model = model.prepared(record.signals)
+    ratios = given_ratios(record, model)
+    assert ratios is not None
+    std = float(model.noise["noise_white"]) / np.sqrt(record.interval) * abs(float(model.gain()))
+    view, bank, have = View(record, model, ratios, std), build_bank(record), skipped(model, record.signals)
+    forms: dict[str, list[Effect]] = {}
+    for block in bank.blocks:
+        if block.effect is not None and block.name not in have:
+            forms.setdefault(block.name, []).append(block.effect)
+    if "bias_step" in bank.scans:
+        epochs = np.quantile(np.asarray(record.signals["time"])[: record.rows], np.linspace(0, 1, STEPS + 2)[1:-1])
+        forms["bias_step"] = [BiasStep(epoch=jnp.asarray(t)) for t in epochs]
+    left = {name: view.columns_of(effects) for name, effects in forms.items()}
+    whole = {name: view.columns_of(effects, whole=True) for name, effects in forms.items()}
+    not_testable = dict(bank.not_testable)
+    for name in list(left):
+        pairs = zip(left[name], whole[name], strict=True)
+        if all(np.linalg.norm(rest) <= VANISHED * np.linalg.norm(own) for rest, own in pairs):
+            not_testable[name] = "cannot be told from what the model already has on this campaign"
+            del left[name]
+    bases = {name: [_basis(c) for c in columns] for name, columns in left.items()}
+    per_unit = {name: _per_unit(forms[name], columns) for name, columns in left.items()}
+    nu = int(record.present.sum()) - len(model.slots())
+
+    def size(name: str, distance: float) -> Size:
+        effect = forms[name][0]
+        field = next(k for k, d in effect.declared().items() if d.linear)
+        unit = parameter_unit(effect, field, record.output_unit, record.units)
+        if effect.site == "gain":
+            return Size(distance / per_unit[name] / float(model.gain()) / factor("ppm", "1"), "ppm")
+        return Size(distance / per_unit[name] * factor(internal_unit(unit), unit), unit)
+
+    detectable = {}
+    for name, columns in left.items():
+        needed = explained_for(threshold + np.log(len(columns)), nu, columns[0].shape[1])
+        detectable[name] = size(name, float(np.sqrt(needed)) + POWER)
+    apart = {}
+    for a, b in itertools.permutations(left, 2):
+        if a in forms[b][0].supersedes or b in forms[a][0].supersedes:
+            continue
+        alike = np.median([max(_cosine(x, y) for y in bases[b]) for x in bases[a]])
+        sine = float(np.sqrt(max(1.0 - alike**2, 0.0)))
+        apart[a, b] = size(a, APART / sine if sine > VANISHED else np.inf)
+    return detectable, apart, not_testable
+
+
+def _per_unit(effects: Sequence[Effect], columns: Sequence[np.ndarray]) -> float:
+    """Distance that a unit of an effect's first parameter makes, in the median of the forms where it makes any."""
+    field = next(k for k, d in effects[0].declared().items() if d.linear)
+    counts = [jnp.size(getattr(e, field)) for e in effects]
+    reach = [np.linalg.norm(c[:, :n], axis=0).max(initial=0.0) for c, n in zip(columns, counts, strict=True)]
+    return float(np.median([r for r in reach if r > VANISHED * max(reach)]))
+
+
+def _cosine(a: np.ndarray, b: np.ndarray) -> float:
+    """Of the smallest principal angle between two spans."""
+    return float(np.linalg.norm(a.T @ b, 2)) if a.size and b.size else 0.0

@@ -1,0 +1,114 @@
+"""What a campaign can tell apart, against least squares by hand in white noise; and whether the test that `diagnose`
+asks for settles what it could not, when an independent simulator carries it out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+import gyromodel
+from gyromodel.campaign import Campaign
+from gyromodel.diagnosis import isolability
+from gyromodel.diagnosis._added_tests import added_tests
+from gyromodel.diagnosis._isolation import APART
+from gyromodel.model import GyroModel, ModelError, model_from_effects
+from tests.truth import study
+from tests.truth.effects import error
+
+N, STEP = 1e-3, 20.0  # deg/h/sqrt(Hz), s
+DEG_H = np.pi / 180 / 3600
+
+
+def log(temperature: np.ndarray, **columns: np.ndarray) -> Campaign:
+    time = np.arange(len(temperature)) * STEP
+    units = {"time": "s", "temperature": "degC", "output": "deg/h"} | dict.fromkeys(columns, "V")
+    values = {"time": time, "temperature": temperature, "output": np.full(len(time), np.nan)} | columns
+    return Campaign(values | {"output": time}, units, {"kind": "rate"})
+
+
+def known_noise(*effects: str) -> GyroModel:
+    return GyroModel(model_from_effects(effects).effects, {"noise_white": jnp.asarray(N * DEG_H)})
+
+
+def left(columns: np.ndarray, *taken: np.ndarray) -> float:
+    """Norm of a signal that other columns cannot take, in standard deviations of a sample."""
+    others = np.column_stack(taken)
+    rest = columns - others @ np.linalg.lstsq(others, columns, rcond=None)[0]
+    return float(np.linalg.norm(rest)) / (N / np.sqrt(STEP))
+
+
+def test_sizes_are_those_of_least_squares_in_white_noise():
+    """A ramp that turns: temperature against a drift and against a second voltage."""
+    i = np.arange(300)
+    temperature, voltage = 20 + 0.1 * np.minimum(i, 500 - i), np.sin(i / 40.0)
+    found = isolability(log(temperature, supply=voltage), known_noise("bias"), tests=False)
+    one, drift = np.ones(300), i * STEP / 3600
+    for a, b in (
+        ("bias_temperature", "bias_drift"),
+        ("bias_drift", "bias_supply"),
+        ("bias_supply", "bias_temperature"),
+    ):
+        signal = {"bias_temperature": temperature, "bias_drift": drift, "bias_supply": voltage}
+        expected = APART / left(signal[a], one, signal[b])
+        assert found.apart[a, b].value == pytest.approx(expected, rel=1e-6)
+    assert [found.detectable[k].unit for k in ("bias_temperature", "bias_drift")] == ["deg/h/degC", "deg/h/h"]
+    # 4.3 standard deviations or a little more: the threshold with 80 %.
+    needed = found.detectable["bias_temperature"].value * left(temperature, one)
+    assert 4.0 < needed < 5.2
+
+
+def test_what_is_one_line_is_never_told_apart():
+    found = isolability(log(20 + 0.1 * np.arange(200.0)), known_noise("bias"))
+    assert found.apart["bias_temperature", "bias_drift"].value > 1e3 * found.detectable["bias_temperature"].value
+    sentence, after = found.tests[0]
+    assert "temperature" in sentence
+    assert after["bias_temperature", "bias_drift"].value < 2.0 * found.detectable["bias_temperature"].value
+    beside = isolability(log(20 + 0.1 * np.arange(200.0)), known_noise("bias", "bias_temperature"), tests=False)
+    assert "bias_drift" not in beside.detectable
+    assert "cannot be told" in beside.not_testable["bias_drift"]
+
+
+def test_the_noise_and_the_scale_factor_must_be_stated():
+    with pytest.raises(ModelError, match="state noise_white"):
+        isolability(log(np.arange(50.0)), model_from_effects(["bias"]))
+
+
+def test_the_predicted_distance_is_the_measured_rate_of_confusion(rng: np.random.Generator):
+    """Two effects at a size where 20 % of campaigns should prefer the wrong one by least squares."""
+    i = np.arange(300)
+    temperature = 20 + 0.1 * np.minimum(i, 500 - i)
+    found = isolability(log(temperature), known_noise("bias"), tests=False)
+    size = found.apart["bias_temperature", "bias_drift"].value * -norm.ppf(0.2) / (APART / 2)
+    one, drift, wrong = np.ones(300), 1.0 * i, 0
+    for _ in range(400):
+        y = size * temperature + N / np.sqrt(STEP) * rng.standard_normal(300)
+        wrong += left(y, one, drift) < left(y, one, temperature)
+    # A rival at its own best size is a little farther than the midpoint between the two.
+    assert wrong / 400 == pytest.approx(0.2, abs=0.08)
+
+
+@pytest.mark.parametrize(("seed", "effect"), [(5, "bias_temperature"), (6, "bias_drift"), (8, "bias_drift")])
+def test_the_next_test_settles_what_was_ambiguous(seed: int, effect: str):
+    """One ramp: a bias over temperature is a drift. The truth lives on through the test that is asked for."""
+    built = study.build(study.Case(seed, "static_ramp", "white", effect, 3.0))
+    first = Campaign(built.columns, built.units, built.metadata)
+    model = model_from_effects(built.truth.baseline)
+    found = gyromodel.diagnose(first, model, hold_out=False)
+    assert found.verdict == "ambiguous"
+    assert {"bias_temperature", "bias_drift"} <= set(found.credible_set)
+    assert found.next_test is not None
+    test = next(t for t in added_tests(first) if found.next_test.startswith(t.sentence))
+    design = built.design
+    temperature = test.campaign.columns["temperature"]
+    lived = replace(design, true=design.true | {"temperature": temperature})
+    rng = np.random.default_rng(seed)
+    output = error(effect, lived, built.truth.amplitude, built.truth.shape) + built.truth.bias
+    output = np.rad2deg(output + built.noise.sample(lived, rng))
+    second = test.campaign.with_column("output", output, "deg/s")
+    settled = gyromodel.diagnose([first, second], model, hold_out=False)
+    # A slow warm-up may still stand for a drift.
+    assert {"bias_temperature", "bias_drift"} & set(settled.credible_set) == {effect}
