@@ -87,7 +87,15 @@ def random_walk_coefficients(
 def stability_squares(
     rate: Float[np.ndarray, "*batch sample"], lengths: Int[np.ndarray, " time"]
 ) -> Float[np.ndarray, "*batch time"]:
-    """Bs²(τ): the variance (3-2) of means over each of some lengths, in samples."""
+    """Bs²(τ): the variance (3-2) of means.
+
+    Args:
+        rate: of a gyro at rest.
+        lengths: of the means, in samples.
+
+    Returns:
+        In the square of the rate's unit.
+    """
     found = []
     for k in lengths:
         whole = rate.shape[-1] // k * k

@@ -89,10 +89,14 @@ class GyroModel(eqx.Module):
             raise ModelError(f"the model has no {label}")
         return eqx.tree_at(lambda m: m.effects, self, self.effects[:where] + self.effects[where + 1 :])
 
+    def columns_needed(self, effect: Effect) -> tuple[str, ...]:
+        """The columns that one of the effects reads; a known scale factor serves without a rate, at rest."""
+        return () if effect.site == "gain" and effect.label in self.wholly_fixed() else effect.columns_needed
+
     def check_columns(self, signals: Signals) -> None:
         """Refuse signals without a column that an effect needs."""
         for effect in self.effects:
-            for name in lacking(effect.columns_needed, signals):
+            for name in lacking(self.columns_needed(effect), signals):
                 close = get_close_matches(effect.label, CATALOGUE, n=1) if isinstance(effect, BiasColumn) else []
                 hint = f"; did you mean {close[0]}?" if close else ""
                 raise ModelError(f"effect {effect.label} needs a column {name}, which the campaign lacks{hint}")

@@ -247,6 +247,9 @@ def fit_currents(soaks: Soaks, temperature: Temperature) -> FunctionFit:
 
     Returns:
         The fit; its value is a `StaticModel` whose fields hold (A0, A1).
+
+    Raises:
+        EstimateError: the currents do not determine the lines, or the fit did not converge.
     """
     known = isinstance(temperature, Uncertain)
     t = np.asarray(temperature.value if known else temperature, float)
@@ -281,6 +284,9 @@ def fit_jointly(
 
     Returns:
         The fit; its value is the `Thermistor` and a `StaticModel` of lines.
+
+    Raises:
+        EstimateError: the readings do not determine the coefficients, or the fit did not converge.
     """
     terms = start.value.terms
     points, segments = len(readings.resistance), terms[1].shape[0]

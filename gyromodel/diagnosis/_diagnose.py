@@ -26,10 +26,13 @@ from gyromodel.diagnosis._verdict import judge
 from gyromodel.estimate import Estimate, EstimateError, check_covariates, fit_record, with_noise_intervals
 from gyromodel.model import GyroModel, record_span
 from gyromodel.noise import NoiseGrid, NoiseRatios, noise_grid
+from gyromodel.poses import at_rest
 from gyromodel.signals import Record, read_signals, with_columns_known
 from gyromodel.units import convertible, factor, from_internal
 
 FEWEST_DRAWS = 200
+# What a pose tells is in its mean: so many rows of all of them are enough.
+POSED_ROWS = 2_000
 # Folds search the noise cells within this many nats of the best of the main pass.
 FOLD_NEARBY = 3.0
 
@@ -89,9 +92,15 @@ def diagnose(
     if 0 < calibrate < FEWEST_DRAWS:
         raise ValueError(f"{calibrate} draws cannot show a 99 % point: calibrate with {FEWEST_DRAWS} or more, or 0")
     say = progress or (lambda line, done: None)
-    campaigns = [campaigns] if isinstance(campaigns, Campaign) else list(campaigns)
-    findings = []
-    shortened = [average(c) for c in campaigns]
+    given = [campaigns] if isinstance(campaigns, Campaign) else list(campaigns)
+    campaigns = [at_rest(c) for c in given]
+    findings = [
+        f"{len(np.unique(posed.columns['position']))} static poses were found in {c.name}; {len(c) - len(posed)} rows "
+        "in motion were left out."
+        for c, posed in zip(given, campaigns, strict=True)
+        if posed is not c
+    ]
+    shortened = [average(c, *([] if c is g else [POSED_ROWS])) for c, g in zip(campaigns, given, strict=True)]
     if any(m > 1 for _, m in shortened):
         most = max(m for _, m in shortened)
         findings.append(

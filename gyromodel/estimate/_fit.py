@@ -18,6 +18,7 @@ from gyromodel.noise import NoiseRatios, from_grams, markov_sum, noise_grid, res
 from gyromodel.numerics.least_squares import Normal, Solution, levenberg_marquardt
 from gyromodel.numerics.state_space import Filter, build_filter, colour, whiten, whitened_gram
 from gyromodel.numerics.uncertain import Source
+from gyromodel.poses import at_rest
 from gyromodel.signals import Record, read_signals
 
 Solver = Literal["levenberg_marquardt", "optimistix"]
@@ -44,7 +45,7 @@ def fit(
     """Fit all free parameters of a model to one unit's campaigns together.
 
     Args:
-        campaigns: measured data of one unit.
+        campaigns: measured data of one unit; of a multi-position test that numbers no positions, the static poses.
         model: what to fit; `noise` empty estimates white noise, flicker and random walk alongside.
         solver: the package's own solver, or optimistix's.
         progress: called with a line and the fraction done.
@@ -54,7 +55,8 @@ def fit(
         EstimateError: the campaign does not determine some combination of parameters, or the fit did not converge.
         ModelError: the model needs columns the campaign lacks.
     """
-    record = read_signals(campaigns)
+    campaigns = [campaigns] if isinstance(campaigns, Campaign) else campaigns
+    record = read_signals([at_rest(c) for c in campaigns])
     if progress:
         progress("fitting", 0.1)
     estimate = with_noise_intervals(fit_record(record, model, solver=solver))
@@ -113,8 +115,9 @@ def fit_record(
 
 def check_covariates(record: Record, model: GyroModel) -> None:
     """Refuse missing values in a column that an effect needs, and a missing column."""
-    for effect in model.prepared(record.signals).effects:
-        for name in effect.columns_needed:
+    model = model.prepared(record.signals)
+    for effect in model.effects:
+        for name in model.columns_needed(effect):
             bad = np.flatnonzero(~np.isfinite(np.asarray(record.signals[name])[: record.rows]) & record.present)
             if len(bad):
                 some = ", ".join(str(i + 1) for i in bad[:5]) + ("…" if len(bad) > 5 else "")

@@ -1,0 +1,64 @@
+"""Static poses of simulated hand-turned tests, of which the true poses are known, and of a measured one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gyromodel._checks import CampaignError
+from gyromodel.campaign import Campaign
+from gyromodel.files import read_campaign
+from gyromodel.poses import at_rest, static_poses
+
+STEP = 0.01
+
+
+def turned(rng: np.random.Generator, poses: int) -> tuple[Campaign, np.ndarray]:
+    """Rests of 3 to 8 s, turns of 1 to 2 s between them; and the number of each row's pose, 0 in motion."""
+    truth, rate, level = [], [], []
+    start = rng.uniform(-1, 1, 3)
+    for k in range(poses):
+        rest, turn = int(rng.uniform(3, 8) / STEP), int(rng.uniform(1, 2) / STEP)
+        end, phase = rng.uniform(-1, 1, 3), (1 - np.cos(np.pi * np.arange(turn) / turn)) / 2
+        truth.append(np.r_[np.full(rest, k + 1), np.zeros(turn)])
+        rate.append(np.r_[np.zeros(rest), rng.uniform(0.5, 1.5) * np.sin(np.pi * np.arange(turn) / turn)])
+        level.append(np.r_[np.tile(start, (rest, 1)), start + (end - start) * phase[:, None]])
+        start = end
+    truth, rate, level = (np.concatenate(v) for v in (truth, rate, level))
+    acceleration = 9.8 * level + 0.02 * rng.standard_normal(level.shape)
+    columns = {"time": np.arange(len(rate)) * STEP, "output": rate + 0.01 * rng.standard_normal(len(rate))}
+    columns |= {f"acceleration_{axis}": acceleration[:, i] for i, axis in enumerate("xyz")}
+    units = {"time": "s", "output": "rad/s"} | {f"acceleration_{axis}": "m/s^2" for axis in "xyz"}
+    return Campaign(columns, units, {"kind": "rate", "test": "multi_position"}), truth
+
+
+def test_poses_are_those_that_were_held():
+    campaign, truth = turned(np.random.default_rng(4), 20)
+    found = at_rest(campaign)
+    kept = np.searchsorted(campaign.columns["time"], found.columns["time"])
+    assert np.array_equal(found.columns["position"], truth[kept])
+    # All rows of a pose but about a window at its ends.
+    assert len(kept) > (truth > 0).sum() - 20 * 1.2 / STEP
+
+
+def test_hand_turned_poses_of_a_measured_unit(measured_data):
+    """Its authors turned it 37 times after a still start."""
+    found = at_rest(read_campaign(measured_data("mems_multiposition_a/campaign.csv.gz")))
+    assert len(np.unique(found.columns["position"])) == 38
+
+
+def test_what_numbers_its_positions_or_is_no_such_test_stays_as_it_is(rng: np.random.Generator):
+    campaign, truth = turned(rng, 3)
+    for other in (campaign.with_metadata({"test": "static"}), campaign.with_column("position", truth, "")):
+        assert at_rest(other) is other
+
+
+def test_without_poses_or_accelerations_there_is_a_sentence(rng: np.random.Generator):
+    campaign, _ = turned(rng, 3)
+    bare = campaign
+    for axis in "xyz":
+        bare = bare.without(f"acceleration_{axis}")
+    with pytest.raises(CampaignError, match="there are none"):
+        static_poses(bare)
+    with pytest.raises(CampaignError, match="shows 1 static poses"):
+        static_poses(campaign.select(slice(0, 250)))
