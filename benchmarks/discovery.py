@@ -20,7 +20,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from tests.truth import study
+from tests.truth import levels, study
 from tests.truth.campaigns import known
 from tests.truth.noise import FAMILY, OUTSIDE
 
@@ -40,7 +40,7 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
-def _row(v: study.Level) -> str:
+def _row(v: levels.Level) -> str:
     low, high = v.interval
     must = f"{'≥' if v.at_least else '≤'} {100 * v.must:.1f} %"
     measured = f"{100 * v.share:.1f} % ({100 * low:.1f}-{100 * high:.1f})"
@@ -127,8 +127,8 @@ def main(argv: list[str] | None = None) -> None:
     drifts = run("drifts", study.drift_cases(args.inseparable, args.seed + 31))
 
     effects = [r for records in sized.values() for r in records]
-    levels = study.null_levels(nulls + outside) + study.effect_levels(effects) + study.unknown_levels(unknown)
-    levels += [*study.ambiguity_levels(inseparable, drifts), study.gain_coverage(sized[3.0])]
+    levels = levels.null_levels(nulls + outside) + levels.effect_levels(effects) + levels.unknown_levels(unknown)
+    levels += [*levels.ambiguity_levels(inseparable, drifts), levels.gain_coverage(sized[3.0])]
     levels.sort(key=lambda v: (float(v.row.rstrip("+")), v.measure))
     everything = [*nulls, *outside, *effects, *unknown, *inseparable, *drifts]
     seconds = [r.answer.seconds for r in everything if r.answer]
@@ -148,7 +148,7 @@ def main(argv: list[str] | None = None) -> None:
         "|---|---|---|---|---|---|---|",
         *map(_row, levels),
         "",
-        f"Mean size of the 95 % set at 3×, isolable campaigns: {study.mean_set_size(sized[3.0]):.2f} (must: ≤ 1.5).",
+        f"Mean size of the 95 % set at 3×, isolable campaigns: {levels.mean_set_size(sized[3.0]):.2f} (must: ≤ 1.5).",
         "",
     ]
     if args.controls:

@@ -9,7 +9,7 @@ from scipy.integrate import quad
 from scipy.stats import binomtest, kstest, kurtosis, norm
 from scipy.stats import t as student_t
 
-from tests.truth import contest, noise, study
+from tests.truth import contest, levels, noise, study
 from tests.truth.campaigns import TESTABLE, UNCATALOGUED, A, B, C, hide
 from tests.truth.designs import DESIGNS
 from tests.truth.effects import EFFECTS, UNKNOWN, coil_temperature_rate, draw_shape, error
@@ -166,10 +166,10 @@ def test_each_design_does_what_it_is_for(rng):
     speeds = [np.median(fast[(fast > 0.8 * fast.max())]), -np.median(fast[fast < 0.8 * fast.min()])]
     assert max(speeds) / min(speeds) > 1.3  # at least two ramp speeds
     assert np.mean(np.abs(fast) < 0.15 * np.abs(fast).max()) > 0.1  # soaks
-    levels = np.unique(c.columns["rate"])
-    assert np.sum(levels > 1e-9) >= 10
-    assert np.sum(levels < -1e-9) >= 10
-    assert np.abs(levels).max() <= 100
+    table = np.unique(c.columns["rate"])
+    assert np.sum(table > 1e-9) >= 10
+    assert np.sum(table < -1e-9) >= 10
+    assert np.abs(table).max() <= 100
     assert np.all(np.diff(d.true["temperature"]) >= 0)
     assert np.corrcoef(d.true["temperature"], d.true["time"])[0, 1] > 0.995
 
@@ -318,13 +318,13 @@ def test_cases_reproduce_and_cover_every_design_and_noise(seed):
 
 
 def test_levels_come_from_the_binomial_law():
-    exact = study.Level("1", "", "", 0.02, False, 2, 400)
+    exact = levels.Level("1", "", "", 0.02, False, 2, 400)
     assert exact.interval == pytest.approx((0.00061, 0.01794), abs=1e-4)  # Clopper-Pearson tables
     assert exact.met
-    assert not study.Level("1", "", "", 0.02, False, 20, 400).met
-    assert study.Level("1", "", "", 0.02, False, 4, 60).plausible
-    assert not study.Level("1", "", "", 0.02, False, 6, 60).plausible
-    assert not study.Level("5", "", "", 0.92, True, 80, 100).plausible
+    assert not levels.Level("1", "", "", 0.02, False, 20, 400).met
+    assert levels.Level("1", "", "", 0.02, False, 4, 60).plausible
+    assert not levels.Level("1", "", "", 0.02, False, 6, 60).plausible
+    assert not levels.Level("5", "", "", 0.92, True, 80, 100).plausible
 
 
 def test_simulators_share_no_code_with_the_package():

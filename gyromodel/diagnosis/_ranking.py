@@ -151,6 +151,19 @@ def cells_of_weight(ranking: Ranking, nats: float) -> list[int]:
     return sorted(near)
 
 
+def noise_kinds(scanner: Scanner, ranking: Ranking) -> dict[str, float]:
+    """Posterior over what the noise is made of with nothing more added, the likeliest first."""
+    weight: dict[str, float] = {}
+    logs = {g: r.log_likelihood + ranking.log_prior[g] for g, r in ranking.results.items()}
+    total = log_sum(list(logs.values()))
+    flicker, walk = scanner.grid.ratios
+    for g, v in logs.items():
+        parts = (("noise_white", True), ("noise_flicker", flicker[g] > 0), ("noise_random_walk", walk[g] > 0))
+        kind = " + ".join(name for name, there in parts if there)
+        weight[kind] = weight.get(kind, 0.0) + float(np.exp(v - total))
+    return dict(sorted(weight.items(), key=lambda item: -item[1]))
+
+
 def line_frequencies(model: GyroModel) -> np.ndarray:
     """Frequencies (Hz) of the lines that a model has."""
     return np.concatenate([np.zeros(0), *(np.ravel(e.frequency) for e in model.effects if isinstance(e, BiasPeriodic))])

@@ -96,7 +96,12 @@ class Driver:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The whole answer; arrays have one entry per campaign row, residuals are measured minus model as a rate."""
+    """The whole answer; arrays have one entry per campaign row, residuals are measured minus model as a rate.
+
+    `noise_kinds` is the posterior over what the noise is made of, "noise_white" alone or more joined by " + "; empty
+    where the model states it. `p_value` is the chance that a campaign of this design with nothing hidden shows as much
+    evidence as this one; None if the threshold was not calibrated.
+    """
 
     verdict: Verdict
     causes: tuple[Cause, ...]
@@ -106,12 +111,14 @@ class Diagnosis:
     minimum_detectable: Mapping[str, tuple[float, str]]
     not_testable: Mapping[str, str]
     noise: Mapping[str, Mapping[str, float | str]]
+    noise_kinds: Mapping[str, float]
     rounds: tuple[Round, ...]
     credible_set: Mapping[str, float]
     unexplained: Mapping[str, float]
     findings: tuple[str, ...]
     threshold: float
     threshold_kind: Literal["safe", "calibrated"]
+    p_value: float | None
     searched: tuple[str, ...]
     campaign: Campaign = field(repr=False)
     predicted_before: np.ndarray = field(repr=False)
@@ -138,11 +145,13 @@ class Diagnosis:
             "minimum_detectable": {k: {"size": s, "unit": u} for k, (s, u) in self.minimum_detectable.items()},
             "not_testable": dict(self.not_testable),
             "noise": {k: dict(v) for k, v in self.noise.items()},
+            "noise_kinds": dict(self.noise_kinds),
             "credible_set": dict(self.credible_set),
             "unexplained": dict(self.unexplained),
             "findings": list(self.findings),
             "rounds": [asdict(r) for r in self.rounds],
             "threshold": self.threshold,
             "threshold_kind": self.threshold_kind,
+            "p_value": self.p_value,
             "searched": list(self.searched),
         }

@@ -9,7 +9,7 @@ import numpy as np
 
 from .designs import Design
 from .effects import EFFECTS, UNKNOWN, draw_shape, error
-from .mde import amplitude, baseline
+from .mde import amplitude, baseline, parts
 from .noise import Noise
 
 Array = np.ndarray
@@ -34,7 +34,10 @@ UNCATALOGUED: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Truth:
-    """What was hidden; `effect` None for nothing, `driver` the columns an uncatalogued effect follows."""
+    """What was hidden: `effect` None for nothing, two joined by "+"; `driver` the columns an unknown effect follows.
+
+    `amplitude` and `shape` are those of the first effect.
+    """
 
     effect: str | None
     amplitude: float = 0.0
@@ -44,6 +47,7 @@ class Truth:
     bias: float = 0.0
     scale_error: float = 0.0
     error: Array = field(default_factory=lambda: np.zeros(0))
+    errors: tuple[Array, ...] = ()  # of each effect
     noise: Array = field(default_factory=lambda: np.zeros(0))
 
 
@@ -57,21 +61,22 @@ def hide(
     names = baseline(design, effect)
     bias = np.deg2rad(rng.uniform(-20, 20) / 3600) if "bias" in names else 0.0
     scale_error = rng.uniform(-1e-3, 1e-3) if "scale_factor" in names else 0.0
-    shape, size, wrong = {}, 0.0, np.zeros(len(design.index))
-    if effect is not None:
-        shape = draw_shape(effect, design, rng)
-        size = float(rng.choice([-1, 1])) * amplitude(effect, design, noise, shape, times_mde)
-        if effect == "scale_sagnac_sine":
+    size, shape, errors = 0.0, {}, []
+    for part in parts(effect)[::-1]:
+        shape = draw_shape(part, design, rng)
+        size = float(rng.choice([-1, 1])) * amplitude(part, design, noise, shape, times_mde)
+        if part == "scale_sagnac_sine":
             size = abs(size)  # a phase has no second sign
-        wrong = error(effect, design, size, shape)
+        errors.insert(0, error(part, design, size, shape))
+    wrong = sum(errors, np.zeros(len(design.index)))
     drawn = noise.sample(design, rng)
     output = design.true["rate"] * (1 + scale_error) + (wrong + bias) * (1 + scale_error) + drawn
     columns = design.columns | {"output": np.rad2deg(output)}
     driver = UNKNOWN[effect][1] if effect in UNKNOWN else None
-    truth = Truth(effect, size, shape, driver, names, bias, scale_error, wrong, drawn)
+    truth = Truth(effect, size, shape, driver, names, bias, scale_error, wrong, tuple(errors), drawn)
     return columns, design.units | {"output": "deg/s"}, dict(design.metadata), truth
 
 
 def known(effect: str | None) -> bool:
-    """Whether the catalogue has this effect."""
-    return effect in EFFECTS
+    """Whether something was hidden, and all of it is in the catalogue."""
+    return effect is not None and all(part in EFFECTS for part in parts(effect))
