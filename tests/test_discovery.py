@@ -18,7 +18,7 @@ from tests.truth.verdicts import ACCEPTED
 # Engine calls; tuned so that the file takes minutes on two cores.
 NULLS = 60
 EFFECTS_1, EFFECTS_3, EFFECTS_10 = 17, 51, 17  # multiples of the 17 effects; at 3 x MDE every effect meets three noises
-UNKNOWN_3, UNKNOWN_10 = 24, 6  # multiples of the 6 uncatalogued effects
+UNKNOWN_3, UNKNOWN_10 = 24, 8  # multiples of the 8 uncatalogued effects
 RETRIES = 9  # further draws of an effect that was missed once
 SLOW = ("bias_drift", "bias_step", "bias_warmup")
 WORKERS = 1 if "PYTEST_XDIST_WORKER" in os.environ else 2

@@ -84,7 +84,12 @@ class Gain:
 
 @dataclass(frozen=True)
 class Driver:
-    """The smooth function of one column (or of time) that an unknown discrepancy follows, with its standard error."""
+    """The smooth function of one column (or of time) that an unknown discrepancy follows, with its standard error.
+
+    `column` may end in _rate (its rate of change) or _lagged (its value some time before). `nearest` is the catalogue
+    effect that comes closest, `nearest_share` what part of the curve's work it does, `behind` by how many nats of
+    evidence it is beaten.
+    """
 
     column: str
     unit: str
@@ -92,6 +97,9 @@ class Driver:
     y: np.ndarray
     std: np.ndarray
     y_unit: str
+    nearest: str = ""
+    nearest_share: float = 0.0
+    behind: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -135,7 +143,8 @@ class Diagnosis:
         if self.driver is not None:
             d = self.driver
             shape = {"x": d.x.tolist(), "y": d.y.tolist(), "std": d.std.tolist(), "x_unit": d.unit, "y_unit": d.y_unit}
-            driver = {"column": d.column, "shape": shape}
+            nearest = {"effect": d.nearest, "share": d.nearest_share, "behind": d.behind} if d.nearest else None
+            driver = {"column": d.column, "shape": shape, "nearest": nearest}
         return {
             "verdict": self.verdict,
             "causes": [asdict(c) for c in self.causes],

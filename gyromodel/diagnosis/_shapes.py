@@ -5,9 +5,9 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from gyromodel.diagnosis._bank import smooth_columns
+from gyromodel.diagnosis._drivers import driver_unit, smooth_columns
 from gyromodel.diagnosis._evidence import explained_for
-from gyromodel.diagnosis._ranking import Ranking, is_driver, skipped
+from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise, skipped
 from gyromodel.diagnosis._result import Driver
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import (
@@ -109,13 +109,27 @@ def driver_shape(scanner: Scanner, selection: Selection, name: str, unit: str) -
     shape = shape - shape.mean(0)
     value = shape @ solution[p:]
     std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", shape, covariance[p:, p:], shape), 0.0))
-    column = smooth_columns(name)[0]
-    file_unit = record.units.get(column, "s")
-    x = np.asarray(record.signals[column])[: record.rows]
+    form, explained, _ = ranking.best_form(name)
+    along = scanner.bank.blocks[int(np.asarray(form))].along
+    assert along is not None
+    file_unit, x = driver_unit(record, smooth_columns(name)[0]), along[: record.rows]
     order = np.argsort(x)[:: max(1, record.rows // 300)]
     scale = factor("rad/s", unit)
     label = " and ".join(smooth_columns(name))
-    return Driver(label, file_unit, from_internal(x[order], file_unit), value[order] * scale, std[order] * scale, unit)
+    found = from_internal(x[order], file_unit), value[order] * scale, std[order] * scale
+    return Driver(label, file_unit, *found, unit, *_nearest(ranking, name, explained))
+
+
+def _nearest(ranking: Ranking, driver: str, explained: float) -> tuple[str, float, float]:
+    """The catalogue effect of most evidence beside a driver: its share of what the curve explains, and how far behind.
+
+    Empty where none has any evidence.
+    """
+    name, statistic = ranking.best(drivers=False, but=("outliers",))
+    if name is None or statistic <= 0 or is_noise(name):
+        return "", 0.0, 0.0
+    share = ranking.best_form(name)[1] / explained
+    return name, float(min(share, 1.0)), float(ranking.statistic[driver] - statistic)
 
 
 def minimum_detectable(scanner: Scanner, ranking: Ranking, threshold: float, unit: str) -> dict[str, tuple[float, str]]:

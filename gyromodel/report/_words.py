@@ -48,7 +48,13 @@ def spoken(name: str) -> str:
 def driver_name(text: str) -> str:
     """The columns of a driver in words, from its label such as "smooth(rate, temperature)"."""
     columns = text.removeprefix("smooth(").removesuffix(")") if text.startswith("smooth(") else text
-    return listed([_DRIVERS.get(column.strip(), spoken(column)) for column in columns.split(",")])
+    return listed([_driven(column.strip()) for column in columns.split(",")])
+
+
+def _driven(column: str) -> str:
+    if column.endswith("_lagged"):
+        return f"{spoken(column.removesuffix('_lagged'))} some time before"
+    return _DRIVERS.get(column, spoken(column))
 
 
 def phrase(effect: str, kind: str = "effect") -> str:

@@ -27,7 +27,14 @@ TESTABLE: dict[str, tuple[str, ...]] = {  # catalogue effects that each design c
 }  # fmt: skip
 UNCATALOGUED: dict[str, tuple[str, ...]] = {
     A: ("temperature_ripple", "rate_ripple", "supply_voltage_ripple", "rate_temperature_bump"),
-    B: ("temperature_ripple", "supply_voltage_ripple", "pressure_bump", "pressure_switch"),
+    B: (
+        "temperature_ripple",
+        "supply_voltage_ripple",
+        "pressure_bump",
+        "pressure_switch",
+        "temperature_rate_switch",
+        "buried_temperature_ripple",
+    ),
     C: ("rate_ripple",),
 }
 

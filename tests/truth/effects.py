@@ -175,6 +175,19 @@ def rate_temperature_bump(design: Design, amplitude: float, at: tuple[float, flo
     return amplitude * np.exp(-0.5 * (((u - at[0]) / width) ** 2 + ((v - at[1]) / width) ** 2))
 
 
+def temperature_rate_switch(design: Design, amplitude: float, width: float) -> Array:
+    """Bias that saturates with the temperature's rate: joints that slip as soon as it moves."""
+    rate = design.true["temperature_rate"]
+    return amplitude * np.tanh(rate / (width * np.abs(rate).max()))
+
+
+def buried_temperature_ripple(design: Design, amplitude: float, cycles: float, phase: float, lag: float) -> Array:
+    """Bias rippling with the temperature of a place that follows the thermometer some time later."""
+    time, surface = design.thermal
+    before = np.interp(design.true["time"] - lag * np.ptp(time), time, surface)
+    return amplitude * np.sin(2 * np.pi * cycles * (before - before.min()) / np.ptp(before) + phase)
+
+
 EFFECTS: dict[str, Effect] = {
     f.__name__: f
     for f in (
@@ -189,6 +202,8 @@ UNKNOWN: dict[str, tuple[Effect, tuple[str, ...]]] = {  # effect and the columns
     "pressure_bump": (pressure_bump, ("pressure",)),
     "pressure_switch": (pressure_switch, ("pressure",)),
     "rate_temperature_bump": (rate_temperature_bump, ("rate", "temperature")),
+    "temperature_rate_switch": (temperature_rate_switch, ("temperature_rate",)),
+    "buried_temperature_ripple": (buried_temperature_ripple, ("temperature_lagged",)),
 }
 
 SCANS = ("bias_step", "bias_periodic", *UNKNOWN)  # effects that are searched for over many positions
@@ -225,6 +240,12 @@ SHAPES: dict[str, Callable[[Design, np.random.Generator], dict[str, Any]]] = {
     "temperature_ripple": _draw_ripple,
     "rate_ripple": _draw_ripple,
     "supply_voltage_ripple": _draw_ripple,
+    "temperature_rate_switch": lambda design, rng: {"width": rng.uniform(0.05, 0.15)},
+    "buried_temperature_ripple": lambda design, rng: {
+        "cycles": rng.uniform(2.0, 3.0),
+        "phase": rng.uniform(0, 2 * np.pi),
+        "lag": rng.uniform(0.02, 0.06),
+    },
     "pressure_bump": lambda design, rng: {"at": rng.uniform(0.3, 0.7), "width": rng.uniform(0.06, 0.12)},
     "pressure_switch": lambda design, rng: {"at": rng.uniform(0.2, 0.4), "width": rng.uniform(0.02, 0.05)},
     "rate_temperature_bump": lambda design, rng: {

@@ -179,21 +179,20 @@ def _isolable(case: Case, truth: Truth, knower: Oracle, signals: contest.Library
     """Whether each hidden effect, the others known, is told from every rival at 3 x MDE."""
     names = parts(case.effect)
     for i, name in enumerate(names):
-        others = [e for k, e in enumerate(truth.errors) if k != i]
         beside = knower
-        if others:
-            beside = replace(knower, basis=np.column_stack([knower.basis, *(_direction(knower, e) for e in others)]))
+        for other, wrong in zip(names, truth.errors, strict=True):
+            # Beside the other as it is, or at any coefficients where it has but one form.
+            block = signals.get(other, np.zeros((0, 0, 0)))
+            taken = block[:, 0] if other != name and block.shape[1] == 1 else wrong[:, None]
+            if other != name:
+                basis = np.column_stack([knower.basis, knower.reduce(taken / np.abs(taken).max())])
+                beside = replace(knower, basis=np.linalg.qr(basis)[0])
         rivals = {k: v for k, v in signals.items() if k == name or k not in names}
         wrong = beside.reduce(truth.errors[i][:, None])[:, 0]
         needed = contest.separation_needed(contest.reduced(beside, rivals), name, wrong)
         if np.linalg.norm(wrong) / case.times_mde * 3 < max(needed.values()):
             return False
     return True
-
-
-def _direction(knower: Oracle, signal: Array) -> Array:
-    rest = knower.reduce(signal[:, None])
-    return rest / np.linalg.norm(rest)
 
 
 def _seeds(seed: int, count: int) -> list[int]:
