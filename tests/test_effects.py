@@ -25,6 +25,7 @@ from gyromodel.units import convertible, factor, internal_unit, parse, quantity
 ROWS = 64
 LABELS = [*sorted(set(CATALOGUE) - {"bias_column"}), "bias_pressure"]
 DEG_H = np.pi / 180 / 3600
+G = 9.80665
 BAND = 30 * 0.519147497289467
 
 
@@ -40,6 +41,11 @@ def signals_of(rng: np.random.Generator) -> dict[str, jax.Array]:
         "temperature_coil": 20 + 14 * np.sin(time / 300 - 0.2),
         "temperature_coil_rate": 0.045 * np.cos(time / 300 - 0.2),
         "pressure": 1e5 + 100 * rng.standard_normal(ROWS),
+        "acceleration_input": 9.8 * rng.uniform(-1, 1, ROWS),
+        "acceleration_spin": 9.8 * rng.uniform(-1, 1, ROWS),
+        "acceleration_output": 9.8 * rng.uniform(-1, 1, ROWS),
+        "vibration": 96.0 * rng.uniform(0, 2, ROWS),
+        "rate_spin": rng.uniform(-1.5, 1.2, ROWS),
         "output": rng.standard_normal(ROWS),
     }
     columns["rate"][:3] = 0.0
@@ -209,6 +215,22 @@ BY_HAND = [
         {"pressure": [1e5, 1.003e5]},
         [0.0, 6.0],
     ),
+    ("bias_acceleration_input", {"coefficient": "2 deg/h/g"}, {"acceleration_input": [G, -0.5 * G]}, [2.0, -1.0]),
+    ("bias_acceleration_spin", {"coefficient": "2 deg/h/g"}, {"acceleration_spin": [G, -0.5 * G]}, [2.0, -1.0]),
+    ("bias_acceleration_output", {"coefficient": "2 deg/h/g"}, {"acceleration_output": [G, -0.5 * G]}, [2.0, -1.0]),
+    (
+        "bias_acceleration_squared",
+        {"coefficients": ["2 deg/h/g^2", "3 deg/h/g^2"]},
+        {"acceleration_input": [G, -G, 0.5 * G], "acceleration_spin": [0.0, 2 * G, G]},
+        [2.0, 2.0 - 6.0, 0.5 + 1.5],
+    ),
+    ("bias_vibration", {"coefficient": "2 deg/h/g^2"}, {"vibration": [0.0, 3 * G**2]}, [0.0, 6.0]),
+    (
+        "bias_anisoinertia",
+        {"coefficient": "0.5 deg/h/(deg/s)^2"},
+        {"rate": [np.deg2rad(10), np.deg2rad(-4)], "rate_spin": [np.deg2rad(2), np.deg2rad(5)]},
+        [10.0, -10.0],
+    ),
     ("scale_asymmetry", {"difference": "100 ppm"}, {"rate": [-2.0, 0.0, 2.0]}, [-50.0, 0.0, 50.0]),
     (
         "scale_nonlinearity",
@@ -274,6 +296,8 @@ def test_equation_by_hand(label: str, fields: dict[str, str], columns: dict[str,
     effect = make_effect(label)
     extra = {"column": "pressure"} if label == "bias_pressure" else {}
     extra = {"harmonics": 1} if label == "lock_in_dithered" else extra
+    if label == "bias_acceleration_squared":
+        extra = {"products": ("acceleration_input*acceleration_input", "acceleration_input*acceleration_spin")}
     effect = type(effect)(**{k: jnp.asarray(internal(v)) for k, v in fields.items()}, **extra)
     signals = {"time": jnp.zeros(len(expected))} | {k: jnp.asarray(v) for k, v in columns.items()}
     effect = effect.prepared(signals) if "temperature_coil" in signals else effect
