@@ -30,7 +30,8 @@ from gyromodel.units import factor, internal_unit
 from tests.test_c_code import CC, STRICT
 
 ROWS = 150
-LABELS = [*sorted(set(CATALOGUE) - {"bias_column", "scale_factor"}), "bias_supply_voltage"]
+REMEMBERING = sorted(name for name, kind in CATALOGUE.items() if kind.remembers)
+LABELS = [*sorted(set(CATALOGUE) - {"bias_column", "scale_factor", *REMEMBERING}), "bias_supply_voltage"]
 needs_compiler = pytest.mark.skipif(CC is None, reason="no C compiler on this machine")
 SCALE = ScaleFactor(value=jnp.asarray(1500.0), unit="count/rad")
 
@@ -183,6 +184,13 @@ class Differencing(BiasColumn):
 def test_effects_with_memory_are_refused(kind: type[BiasColumn], reason: str):
     effect = kind(coefficient=jnp.asarray(1.0), column="pressure", reference=jnp.asarray(0.0))
     with pytest.raises(ModelError, match=f"bias_pressure cannot be exported to C.*{reason}"):
+        export_calibration(Calibration(GyroModel((effect,))), "c")
+
+
+@pytest.mark.parametrize("label", REMEMBERING)
+def test_effects_of_neighbouring_samples_are_refused(label: str):
+    effect = make_effect(label)
+    with pytest.raises(ModelError, match=f"{label} cannot be exported to C: it looks at other samples"):
         export_calibration(Calibration(GyroModel((effect,))), "c")
 
 

@@ -189,7 +189,10 @@ def test_any_numbers_survive_bit_for_bit(tmp_path: Path, numbers: list[float], p
     assert contents(read_model(tmp_path / "any.yaml")) == contents(model)
 
 
-NEEDED_BESIDES = {"acceleration_input", "acceleration_spin", "acceleration_output", "vibration", "rate_spin"}
+NEEDED_BESIDES = {
+    "acceleration_input", "acceleration_spin", "acceleration_output", "vibration", "rate_spin", "rate_output",
+    "magnetic_field", "azimuth", "table_angle",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("label", [*sorted(set(CATALOGUE) - {"bias_column"}), "bias_supply_voltage"])

@@ -21,12 +21,21 @@ PAIR_SCALES = (0.25, 0.6)
 # Columns whose linear effect on the bias is in the catalogue, is the scale factor, or means nothing.
 OWN_EFFECTS = ("rate", "temperature", "campaign")
 # The effect that follows a column in its own way, so that a bias proportional to the column is not searched besides.
-OWNERS = {
-    "acceleration_input": "bias_acceleration_input",
-    "acceleration_spin": "bias_acceleration_spin",
-    "acceleration_output": "bias_acceleration_output",
-    "vibration": "bias_vibration",
-}
+OWNERS = (
+    {
+        "acceleration_input": "bias_acceleration_input",
+        "acceleration_spin": "bias_acceleration_spin",
+        "acceleration_output": "bias_acceleration_output",
+        "vibration": "bias_vibration",
+        "magnetic_field": "bias_magnetic",
+        "rate_spin": "misalignment",
+        "rate_output": "misalignment",
+        "azimuth": "table_tilt",
+        "table_angle": "table_harmonic",
+    }
+    | {f"magnetic_field_{axis}": "bias_magnetic" for axis in "xyz"}
+    | {f"rate_{axis}": "misalignment" for axis in "xyz"}
+)
 # What `compensate` adds is the output itself.
 NOT_DRIVERS = ("time", "output", "segment", "run", "position", "rate_estimated", "rate_estimated_std")
 
