@@ -266,12 +266,12 @@ BY_HAND = [
         {"time": np.arange(6.0), "rate": DEG_H * np.arange(6.0) ** 3},
         [0.0, *((t - 0.5) ** 3 - t**3 for t in range(1, 6))],
     ),
-    # The lag of a ramp that begins in step: y = t − τ (1 − exp(−t/τ)).
+    # The lag of t²: d = −2τt + 2τ²(1 − exp(−t/τ)).
     (
         "bandwidth",
         {"share": "1", "time_constant": "2 s"},
-        {"time": np.arange(6.0), "rate": DEG_H * np.arange(6.0)},
-        [-2.0 * (1.0 - np.exp(-t / 2.0)) for t in range(6)],
+        {"time": np.arange(6.0), "rate": DEG_H * np.arange(6.0) ** 2},
+        [-4.0 * t + 8.0 * (1.0 - np.exp(-t / 2.0)) for t in range(6)],
     ),
     (
         "output_axis_acceleration",
@@ -280,7 +280,7 @@ BY_HAND = [
             "time": [0.0, 1.0, 3.0, 4.0, 100.0, 101.0],
             "rate_output": [x * DEG_H for x in (0.0, 1.0, 9.0, 16.0, 5.0, 9.0)],
         },
-        [0.5, 1.0, 3.0, 3.5, 2.0, 2.0],
+        [0.0, 1.0, 3.0, 4.0, 2.0, 2.0],
     ),
     ("scale_asymmetry", {"difference": "100 ppm"}, {"rate": [-2.0, 0.0, 2.0]}, [-50.0, 0.0, 50.0]),
     (

@@ -17,6 +17,8 @@ from gyromodel.model import GyroModel
 # Cells within this many nats of the best, for any candidate that matters, get their neighbours searched too: those
 # better than nothing added and not hopelessly behind the best.
 NEARBY, HOPELESS = 7.0, 30.0
+# What explains all but this part of what another explains is the same signal.
+ALIKE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,20 @@ class Ranking:
     def best_form(self, name: str) -> tuple[int | tuple[int, ...], float, float]:
         """Form, explained sum and dimension of a candidate where it is best."""
         return self.results[self.best_cell(name)].best[name]
+
+    def twins(self, name: str) -> set[str]:
+        """Effects that explain as much of the data as a candidate, with at most one coefficient more.
+
+        Their signals hold the candidate's: no size of it would tell them apart on this campaign.
+        """
+        best = self.results[self.best_cell(name)].best
+        _, explained, q = best[name]
+        return {
+            k
+            for k, (_, t, width) in best.items()
+            if k not in (name, "outliers") and k in self.statistic and not is_driver(k) and not is_noise(k)
+            and width <= q + 1 and t >= (1.0 - ALIKE) * explained
+        }  # fmt: skip
 
 
 def is_driver(name: str) -> bool:
