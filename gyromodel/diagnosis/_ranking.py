@@ -12,11 +12,13 @@ from gyromodel.diagnosis._evidence import log_sum
 from gyromodel.diagnosis._scan import CellResult, Scanner
 from gyromodel.effects.drivers import BiasColumn, BiasPeriodic
 from gyromodel.estimate import Estimate
-from gyromodel.model import GyroModel
+from gyromodel.model import GyroModel, effect_class
 
 # Cells within this many nats of the best, for any candidate that matters, get their neighbours searched too: those
 # better than nothing added and not hopelessly behind the best.
 NEARBY, HOPELESS = 7.0, 30.0
+# What explains all but this part of what another explains is the same signal.
+ALIKE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,22 @@ class Ranking:
     def best_form(self, name: str) -> tuple[int | tuple[int, ...], float, float]:
         """Form, explained sum and dimension of a candidate where it is best."""
         return self.results[self.best_cell(name)].best[name]
+
+    def twins(self, name: str) -> set[str]:
+        """Effects that explain as much of the data as a candidate, with at most one coefficient more.
+
+        Their signals hold the candidate's: no size of it would tell them apart on this campaign. Of those that contain
+        one another only the simplest counts.
+        """
+        best = self.results[self.best_cell(name)].best
+        _, explained, q = best[name]
+        alike = {
+            k
+            for k, (_, t, width) in best.items()
+            if k != "outliers" and k in self.statistic and not is_driver(k) and not is_noise(k)
+            and width <= q + 1 and t >= (1.0 - ALIKE) * explained
+        }  # fmt: skip
+        return {k for k in alike - {name} if not alike & set(effect_class(k).supersedes) - {k}}
 
 
 def is_driver(name: str) -> bool:

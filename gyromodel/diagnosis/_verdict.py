@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats
 
 from gyromodel.diagnosis._drivers import smooth_columns
-from gyromodel.diagnosis._ranking import Ranking, is_driver
+from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise
 from gyromodel.diagnosis._result import Cause, Confuser, ParameterValue, Verdict
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import (
@@ -59,6 +59,9 @@ def credible(
     own = {k: v for k, v in ranking.statistic.items() if not is_driver(k) and (k == name or k not in apart)}
     hidden_by_walk = name in NO_EDGE and ranking.walks[ranking.best_cell(name)]
     too_close = name in SLOW_IN_TIME and statistic < TIME_MARGIN and ranking.slow_noise
+    if name not in ("outliers", "bias_step", "bias_periodic") and not is_noise(name):
+        # Only the number of forms and coefficients sets them apart, which is no evidence.
+        own |= dict.fromkeys(ranking.twins(name) & own.keys(), own[name])
     if runs < 2 and (hidden_by_walk or too_close):
         own["noise_random_walk"] = max(0.0, statistic - 1.0)
     top = max(own.values())
