@@ -105,6 +105,8 @@ def build_bank(record: Record) -> Bank:
             forms = kind.candidates(signals)
             if not forms:
                 not_testable[name] = kind.untested
+            elif part := kind.hidden(signals):
+                not_testable[f"part of {name}"] = part
             blocks.extend((name, "effect", _weighted(e, signals, rate), e) for e in forms)
     for name in record.signals:
         reason = "" if is_no_driver(name) else unusable(record, name)

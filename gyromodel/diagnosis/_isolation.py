@@ -32,6 +32,8 @@ STEPS, VANISHED = 25, 1e-6
 # A test is worth asking for if it brings two effects this many times as far apart; repeating all gives 1.4. More than
 # MOST counts no more.
 WORTHWHILE, MOST = 1.5, 100.0
+# A test that leaves two effects closer than this would have to be done a hundred times.
+LEAST = APART / 10.0
 
 
 class View:
@@ -127,7 +129,7 @@ def settling_test(
     now = distance()[0]
     tried = [(*distance(_output_known(test.campaign, 1)), test.sentence) for test in added_tests(campaigns[-1])]
     reached, *closest, sentence = max(tried, key=lambda t: t[0])
-    if not reached > WORTHWHILE * now:
+    if not reached > max(WORTHWHILE * now, LEAST):
         return None
     again = "" if reached >= APART else f" Do it {int(np.ceil((APART / reached) ** 2))} times."
     return (

@@ -119,6 +119,8 @@ def judge(
                 continue
         if name in baseline.model.wholly_fixed():
             findings.append(f"{name} is fixed in the simulation at a value that the data contradict: it was set free.")
+        if name == "scale_factor":
+            findings.append("A scale error of the rate table would look the same: check it against a second reference.")
         close = _close_rival(step, members)
         findings += [close] if close else []
         turn = sum(f.name == name for f in found[i:])

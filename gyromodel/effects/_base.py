@@ -110,6 +110,11 @@ class Effect(eqx.Module):
         return [cls().prepared(signals)]
 
     @classmethod
+    def hidden(cls, signals: Signals) -> str:
+        """What part of a searched effect a campaign cannot show, and why; empty if none."""
+        return ""
+
+    @classmethod
     def declared(cls) -> dict[str, Parameter]:
         """Parameter declarations by field name."""
         return {f.name: f.metadata["parameter"] for f in fields(cls) if "parameter" in f.metadata}

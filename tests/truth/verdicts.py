@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from .campaigns import Truth, known
 from .mde import parts
+from .motion import LAGS
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,21 @@ ACCEPTED = (
     Accepted("bias_warmup", frozenset(), True, _SLOW),
     Accepted("scale_sagnac_sine", frozenset({"scale_nonlinearity"}), True, "a sine equals a cubic to third order"),
     Accepted("bias_temperature", frozenset(), True, "temperature is a line in time on one ramp", ("static_ramp",)),
+    *(Accepted(e, frozenset(), True, "to first order both are the slope of the rate") for e in LAGS),
+    *(
+        Accepted(
+            e,
+            frozenset(),
+            True,
+            "beside scale factor and bias one direction in the plane is left",
+            ("one_axis_tumble",),
+        )
+        for e in ("misalignment", "bias_acceleration_input", "bias_acceleration_spin")
+    ),
+    *(
+        Accepted(e, frozenset(), True, "each is one turn of the same angle", ("one_field",))
+        for e in ("table_tilt", "bias_magnetic", "table_harmonic")
+    ),
 )
 
 
