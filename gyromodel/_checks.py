@@ -37,6 +37,9 @@ _EXPECTED = tuple(
         (r"attitude_[wxyz]|segment|run|position", "a plain number", "[]"),
     )
 )
+# Columns whose unit is free, but for the effect that is named after them: mean square acceleration.
+_USUAL = {"vibration": "m^2/s^4"}
+_AXES = (("input", "spin", "output"), ("x", "y", "z"))
 # Raw counts say nothing about the kind, and neither does an analogue voltage.
 _OUTPUT_UNITS = {
     "rate": ["deg/s", "deg/h", "rad/s", "count", "bit", "V", "count/s", "bit/s", "V/s", "A", "Hz"],
@@ -86,7 +89,13 @@ def _known(name: str) -> tuple[str, list[str]] | None:
 def usual_unit(name: str) -> str:
     """Internal unit of a known column; dimensionless for any other."""
     known = _known(name)
-    return unit_system.internal_unit(known[1][0]) if known else ""
+    return unit_system.internal_unit(known[1][0]) if known else _USUAL.get(name, "")
+
+
+def of_usual_unit(name: str, unit: str) -> bool:
+    """Whether a column is in a unit that the effects of that column can take, which raw counts are not."""
+    usual = usual_unit(name)
+    return not usual or unit_system.convertible(unit, usual)
 
 
 def check_time(time: np.ndarray, first_row: int = 1, previous: float | None = None) -> None:
@@ -118,6 +127,18 @@ def check_time(time: np.ndarray, first_row: int = 1, previous: float | None = No
 def thermometers(names: Iterable[str]) -> list[str]:
     """Those of the names that are thermometers, `temperature` before every temperature_<place>."""
     return sorted(name for name in names if _THERMOMETER.fullmatch(name))
+
+
+def along_axes(kind: str, names: Iterable[str]) -> list[str]:
+    """The columns of a vector among some names: by the gyro's axes, <kind>_input/_spin/_output, else by x, y, z."""
+    names = set(names)
+    found = [[f"{kind}_{axis}" for axis in axes if f"{kind}_{axis}" in names] for axes in _AXES]
+    return found[0] or found[1]
+
+
+def accelerations(names: Iterable[str]) -> list[str]:
+    """The columns of specific force among some names."""
+    return along_axes("acceleration", names)
 
 
 def shown(text: str) -> str:

@@ -18,7 +18,7 @@ from gyromodel._checks import thermometers
 from gyromodel.campaign import Campaign
 from gyromodel.effects import Signals
 from gyromodel.estimate import Calibration, check_covariates, validity_unit
-from gyromodel.model import GyroModel, check_units
+from gyromodel.model import GyroModel, ModelError, check_units
 from gyromodel.signals import Record, read_signals
 from gyromodel.units import from_internal
 
@@ -52,12 +52,15 @@ def compensate(campaign: Campaign, calibration: Calibration) -> Campaign:
 
     Raises:
         CampaignError: the campaign has several axes.
-        ModelError: the model needs a column that the campaign lacks, or is of other units.
+        ModelError: the model needs a column that the campaign lacks, is of other units, or an effect depends on the
+            rates of other samples.
     """
     record = read_signals(campaign)
     record = record._replace(signals=record.signals | {"rate": jnp.zeros_like(record.signals["time"])})
     # What the calibration leaves open, such as which thermometers, is the campaign's; what it states stays.
     model = calibration.model.prepared(record.signals)
+    if late := next((e.label for e in model.effects if e.remembers and "rate" in e.columns_needed), None):
+        raise ModelError(f"{late} depends on the rates around a sample, and one output tells one rate: leave it out")
     calibration = replace(calibration, model=model)
     check_covariates(record, model)
     check_units(model, record.output_unit, record.units)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from gyromodel._checks import of_usual_unit, usual_unit
 from gyromodel.campaign import Campaign
 from gyromodel.declarations import column_of
 from gyromodel.effects import CATALOGUE, Effect, Signals
@@ -245,6 +246,12 @@ def check_units(model: GyroModel, output_unit: str, units: Mapping[str, str]) ->
     if output_unit != "rad/s" and not any(e.site == "gain" for e in model.effects):
         raise ModelError(f"the output is in [{output_unit}], which is no angular rate: the model needs a scale_factor")
     for effect in model.effects:
+        foreign = [n for n in effect.columns_needed if n in units and not of_usual_unit(n, units[n])]
+        if foreign and not isinstance(effect, BiasColumn):
+            raise ModelError(
+                f"{effect.label} needs {foreign[0]} in a unit like {usual_unit(foreign[0])}, but it is in "
+                f"[{units[foreign[0]]}]"
+            )
         written = getattr(effect, "unit", "")
         if not written:
             continue

@@ -274,6 +274,8 @@ def _read_parameter(place: _Place, effect: Effect, name: str) -> dict[str, Any]:
 
 def _read_setting(place: _Place, effect: Effect, name: str) -> Any:
     default = getattr(effect, name)
+    if isinstance(default, str):
+        return place.text()
     if isinstance(default, tuple | int):
         places = place.items(name) if isinstance(default, tuple) else [place]
         texts = [p.text() for p in places]
@@ -339,9 +341,9 @@ def _document(model: GyroModel, estimate: Estimate | None) -> dict[str, Any]:
                 entry[name] = {"value": entry[name], "std": _shown(np.reshape(known, values.shape), unit)}
         for name in effect.settings():
             value = getattr(effect, name)
-            if isinstance(value, tuple) and not any(value):
+            if value == "" or (isinstance(value, tuple) and not any(value)):
                 continue
-            if isinstance(value, tuple | int):
+            if isinstance(value, tuple | int | str):
                 entry[name] = list(value) if isinstance(value, tuple) else value
             elif np.isfinite(float(value)):
                 entry[name] = _exact_text(float(value), _setting_unit(effect, name, record))

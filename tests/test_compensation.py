@@ -18,6 +18,7 @@ from gyromodel.campaign import Campaign
 from gyromodel.compensation import compensate
 from gyromodel.effects import Effect
 from gyromodel.effects.drivers import Bias, BiasDrift
+from gyromodel.effects.dynamics import Bandwidth, TimeDelay
 from gyromodel.effects.readout import LockIn
 from gyromodel.effects.scale import (
     ScaleAsymmetry,
@@ -316,6 +317,8 @@ def test_the_fit_s_reference_points_are_used(rng: np.random.Generator):
         ((BiasTemperature(coefficient=value(1.0), reference=value(20.0)),), "rad/s", "needs a column temperature"),
         ((Bias(),), "count/s", "needs a scale_factor"),
         ((ScaleFactor(value=value(2.0), unit="count/deg"),), "V", "scale_factor is in count/deg"),
+        ((TimeDelay(delay=value(0.1)),), "rad/s", "time_delay depends on the rates around a sample"),
+        ((Bandwidth(time_constant=value(0.1)),), "rad/s", "bandwidth depends on the rates around a sample"),
     ],
 )
 def test_what_does_not_fit_the_campaign_is_refused(effects: tuple[Effect, ...], unit: str, expected: str):

@@ -25,6 +25,7 @@ from gyromodel.units import convertible, factor, internal_unit, parse, quantity
 ROWS = 64
 LABELS = [*sorted(set(CATALOGUE) - {"bias_column"}), "bias_pressure"]
 DEG_H = np.pi / 180 / 3600
+G = 9.80665
 BAND = 30 * 0.519147497289467
 
 
@@ -40,6 +41,15 @@ def signals_of(rng: np.random.Generator) -> dict[str, jax.Array]:
         "temperature_coil": 20 + 14 * np.sin(time / 300 - 0.2),
         "temperature_coil_rate": 0.045 * np.cos(time / 300 - 0.2),
         "pressure": 1e5 + 100 * rng.standard_normal(ROWS),
+        "acceleration_input": 9.8 * rng.uniform(-1, 1, ROWS),
+        "acceleration_spin": 9.8 * rng.uniform(-1, 1, ROWS),
+        "acceleration_output": 9.8 * rng.uniform(-1, 1, ROWS),
+        "vibration": 96.0 * rng.uniform(0, 2, ROWS),
+        "rate_spin": rng.uniform(-1.5, 1.2, ROWS),
+        "rate_output": np.sin(time / 100),
+        "azimuth": rng.uniform(0, 6, ROWS),
+        "table_angle": rng.uniform(0, 60, ROWS),
+        "magnetic_field": 1e-4 * rng.uniform(-1, 1, ROWS),
         "output": rng.standard_normal(ROWS),
     }
     columns["rate"][:3] = 0.0
@@ -209,6 +219,69 @@ BY_HAND = [
         {"pressure": [1e5, 1.003e5]},
         [0.0, 6.0],
     ),
+    ("bias_acceleration_input", {"coefficient": "2 deg/h/g"}, {"acceleration_input": [G, -0.5 * G]}, [2.0, -1.0]),
+    ("bias_acceleration_spin", {"coefficient": "2 deg/h/g"}, {"acceleration_spin": [G, -0.5 * G]}, [2.0, -1.0]),
+    ("bias_acceleration_output", {"coefficient": "2 deg/h/g"}, {"acceleration_output": [G, -0.5 * G]}, [2.0, -1.0]),
+    (
+        "bias_acceleration_squared",
+        {"coefficients": ["2 deg/h/g^2", "3 deg/h/g^2"]},
+        {"acceleration_input": [G, -G, 0.5 * G], "acceleration_spin": [0.0, 2 * G, G]},
+        [2.0, 2.0 - 6.0, 0.5 + 1.5],
+    ),
+    ("bias_vibration", {"coefficient": "2 deg/h/g^2"}, {"vibration": [0.0, 3 * G**2]}, [0.0, 6.0]),
+    (
+        "bias_anisoinertia",
+        {"coefficient": "0.5 deg/h/(deg/s)^2"},
+        {"rate": [np.deg2rad(10), np.deg2rad(-4)], "rate_spin": [np.deg2rad(2), np.deg2rad(5)]},
+        [10.0, -10.0],
+    ),
+    (
+        "misalignment",
+        {"angles": ["3600 arcsec", "-3600 arcsec"]},
+        {"rate_spin": [180 / np.pi * DEG_H, 0.0], "rate_output": [0.0, 360 / np.pi * DEG_H]},
+        [1.0, -2.0],
+    ),
+    (
+        "table_tilt",
+        {"north": "3 deg/h", "east": "4 deg/h"},
+        {"azimuth": [0.0, np.pi / 2, np.pi]},
+        [3.0, 4.0, -3.0],
+    ),
+    (
+        "table_harmonic",
+        {"cosine": ["3 deg/h", "1 deg/h"], "sine": ["4 deg/h", "2 deg/h"]},
+        {"table_angle": [0.0, np.pi / 2, np.pi / 4]},
+        [3.0 + 1.0, 4.0 - 1.0, 3.5 * np.sqrt(2) + 2.0],
+    ),
+    (
+        "bias_magnetic",
+        {"coefficients": ["2 deg/h/gauss"], "cosine": ["3 deg/h"], "sine": ["4 deg/h"]},
+        {"magnetic_field": [0.5e-4, 0.0], "table_angle": [0.0, np.pi / 2]},
+        [1.0 + 3.0, 4.0],
+    ),
+    # t³ and its steps are within what a cubic between samples is exact for.
+    (
+        "time_delay",
+        {"share": "1", "delay": "0.5 s"},
+        {"time": np.arange(6.0), "rate": DEG_H * np.arange(6.0) ** 3},
+        [0.0, *((t - 0.5) ** 3 - t**3 for t in range(1, 6))],
+    ),
+    # The lag of a ramp that begins in step: y = t − τ (1 − exp(−t/τ)).
+    (
+        "bandwidth",
+        {"share": "1", "time_constant": "2 s"},
+        {"time": np.arange(6.0), "rate": DEG_H * np.arange(6.0)},
+        [-2.0 * (1.0 - np.exp(-t / 2.0)) for t in range(6)],
+    ),
+    (
+        "output_axis_acceleration",
+        {"coefficient": "0.5 s"},
+        {
+            "time": [0.0, 1.0, 3.0, 4.0, 100.0, 101.0],
+            "rate_output": [x * DEG_H for x in (0.0, 1.0, 9.0, 16.0, 5.0, 9.0)],
+        },
+        [0.5, 1.0, 3.0, 3.5, 2.0, 2.0],
+    ),
     ("scale_asymmetry", {"difference": "100 ppm"}, {"rate": [-2.0, 0.0, 2.0]}, [-50.0, 0.0, 50.0]),
     (
         "scale_nonlinearity",
@@ -261,6 +334,19 @@ BY_HAND = [
     ),
 ]
 
+# Settings that say which form of an effect is meant.
+SETTINGS: dict[str, dict[str, object]] = {
+    "bias_pressure": {"column": "pressure"},
+    "lock_in_dithered": {"harmonics": 1},
+    "bias_acceleration_squared": {
+        "products": ("acceleration_input*acceleration_input", "acceleration_input*acceleration_spin")
+    },
+    "bias_magnetic": {"field": ("magnetic_field",), "angle": "table_angle"},
+    "misalignment": {"about": ("rate_spin", "rate_output")},
+    "table_harmonic": {"orders": (1, 2)},
+    "table_tilt": {"angle": "azimuth"},
+}
+
 
 def internal(written: str | list[str]) -> np.ndarray:
     if isinstance(written, list):
@@ -272,9 +358,7 @@ def internal(written: str | list[str]) -> np.ndarray:
 @pytest.mark.parametrize(("label", "fields", "columns", "expected"), BY_HAND, ids=[row[0] for row in BY_HAND])
 def test_equation_by_hand(label: str, fields: dict[str, str], columns: dict[str, list[float]], expected: list[float]):
     effect = make_effect(label)
-    extra = {"column": "pressure"} if label == "bias_pressure" else {}
-    extra = {"harmonics": 1} if label == "lock_in_dithered" else extra
-    effect = type(effect)(**{k: jnp.asarray(internal(v)) for k, v in fields.items()}, **extra)
+    effect = type(effect)(**{k: jnp.asarray(internal(v)) for k, v in fields.items()}, **SETTINGS.get(label, {}))
     signals = {"time": jnp.zeros(len(expected))} | {k: jnp.asarray(v) for k, v in columns.items()}
     effect = effect.prepared(signals) if "temperature_coil" in signals else effect
     unit = DEG_H if effect.site == "rate" else 1e-6

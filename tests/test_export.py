@@ -30,17 +30,20 @@ from gyromodel.units import factor, internal_unit
 from tests.test_c_code import CC, STRICT
 
 ROWS = 150
-LABELS = [*sorted(set(CATALOGUE) - {"bias_column", "scale_factor"}), "bias_supply_voltage"]
+REMEMBERING = sorted(name for name, kind in CATALOGUE.items() if kind.remembers)
+LABELS = [*sorted(set(CATALOGUE) - {"bias_column", "scale_factor", *REMEMBERING}), "bias_supply_voltage"]
 needs_compiler = pytest.mark.skipif(CC is None, reason="no C compiler on this machine")
 SCALE = ScaleFactor(value=jnp.asarray(1500.0), unit="count/rad")
 
 
-def campaign(rng: np.random.Generator, *names: str) -> Campaign:
+def campaign(rng: np.random.Generator, *wanted: str) -> Campaign:
     """Counts, with whatever columns effects need."""
     columns = {"time": np.arange(ROWS) * 20.0, "output": 1500 * rng.uniform(-1.2, 1.2, ROWS)}
     units = {"time": "s", "output": "count/s"}
     columns["temperature"], units["temperature"] = 25 + 15 * np.sin(columns["time"] / 300), "degC"
-    for name in {name.replace("<place>", "coil") for name in names} - {"time", "rate", "temperature"}:
+    # Of columns that serve alike, the first.
+    names = {name.partition(" or ")[0].replace("<place>", "coil").replace("<axis>", "x") for name in wanted}
+    for name in names - {"time", "rate", "temperature"}:
         columns[name], units[name] = rng.uniform(0.5, 1.5, ROWS), usual_unit(name)
     return Campaign(columns, units, {"kind": "rate", "time_since_power_on": 40.0})
 
@@ -95,7 +98,7 @@ def members_of(measured: Campaign) -> dict[str, np.ndarray]:
     }  # fmt: skip
     named |= {f"{name}_degC_per_s": v for name, v in values.items() if name.endswith("_rate")}
     for name in measured.covariates:
-        unit = internal_unit(measured.units[name]).replace("/", "_per_").replace("^", "")
+        unit = internal_unit(measured.units[name]).replace("/", "_per_").replace("^", "_")
         named[f"{name}_{unit or 'number'}"] = values[name]
     return named
 
@@ -181,6 +184,13 @@ class Differencing(BiasColumn):
 def test_effects_with_memory_are_refused(kind: type[BiasColumn], reason: str):
     effect = kind(coefficient=jnp.asarray(1.0), column="pressure", reference=jnp.asarray(0.0))
     with pytest.raises(ModelError, match=f"bias_pressure cannot be exported to C.*{reason}"):
+        export_calibration(Calibration(GyroModel((effect,))), "c")
+
+
+@pytest.mark.parametrize("label", REMEMBERING)
+def test_effects_of_neighbouring_samples_are_refused(label: str):
+    effect = make_effect(label)
+    with pytest.raises(ModelError, match=f"{label} cannot be exported to C: it looks at other samples"):
         export_calibration(Calibration(GyroModel((effect,))), "c")
 
 

@@ -189,11 +189,18 @@ def test_any_numbers_survive_bit_for_bit(tmp_path: Path, numbers: list[float], p
     assert contents(read_model(tmp_path / "any.yaml")) == contents(model)
 
 
+NEEDED_BESIDES = {
+    "acceleration_input", "acceleration_spin", "acceleration_output", "vibration", "rate_spin", "rate_output",
+    "magnetic_field", "azimuth", "table_angle",
+}  # fmt: skip
+
+
 @pytest.mark.parametrize("label", [*sorted(set(CATALOGUE) - {"bias_column"}), "bias_supply_voltage"])
 def test_every_effect_is_written_and_read(label: str, tmp_path: Path):
     columns = {k: jnp.linspace(-1.0, 2.0, 16) for k in ("time", "time_on", "rate", "temperature", "supply_voltage")}
     signals = columns | {"output": 3.0 * columns["rate"], "temperature_rate": columns["rate"]}
     signals |= {"temperature_coil": 2.0 * columns["rate"], "temperature_coil_rate": 3.0 * columns["rate"]}
+    signals |= dict.fromkeys(NEEDED_BESIDES, columns["rate"])
     model = GyroModel((make_effect(label).prepared(signals),), {}, frozenset(), "fog")
     write_model(model, tmp_path / "one.yaml")
     again = read_model(tmp_path / "one.yaml")

@@ -14,6 +14,7 @@ from tests.truth.campaigns import TESTABLE, UNCATALOGUED, A, B, C, hide
 from tests.truth.designs import DESIGNS
 from tests.truth.effects import EFFECTS, UNKNOWN, coil_temperature_rate, draw_shape, error
 from tests.truth.mde import REGULAR, SCAN, amplitude, baseline, oracle, simpler, target
+from tests.truth.motion_designs import MOTION_DESIGNS
 
 RARE = 1e-5  # chance that a right simulator fails one statistical check
 
@@ -242,7 +243,7 @@ def _every_hidden() -> list[tuple[str, str]]:
 
 @pytest.mark.parametrize(("name", "effect"), _every_hidden())
 def test_hidden_effects_have_the_size_asked_for(name, effect, rng):
-    design = DESIGNS[name](rng)
+    design = (DESIGNS | MOTION_DESIGNS)[name](rng)
     law = noise.draw("flicker", design, rng)
     columns, units, metadata, truth = hide(effect, design, law, 3.0, rng)
     judge = oracle(design, law, baseline(design, effect) + simpler(effect))

@@ -7,8 +7,9 @@ from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
-from gyromodel._checks import DERIVED
+from gyromodel._checks import DERIVED, of_usual_unit, usual_unit
 from gyromodel.effects import CATALOGUE, Effect, Signals
 from gyromodel.effects._base import lacking
 from gyromodel.effects.drivers import BiasColumn
@@ -19,6 +20,22 @@ SMOOTH_SCALES = (0.08, 0.2, 0.5)
 PAIR_SCALES = (0.25, 0.6)
 # Columns whose linear effect on the bias is in the catalogue, is the scale factor, or means nothing.
 OWN_EFFECTS = ("rate", "temperature", "campaign")
+# The effect that follows a column in its own way, so that a bias proportional to the column is not searched besides.
+OWNERS = (
+    {
+        "acceleration_input": "bias_acceleration_input",
+        "acceleration_spin": "bias_acceleration_spin",
+        "acceleration_output": "bias_acceleration_output",
+        "vibration": "bias_vibration",
+        "magnetic_field": "bias_magnetic",
+        "rate_spin": "misalignment",
+        "rate_output": "misalignment",
+        "azimuth": "table_tilt",
+        "table_angle": "table_harmonic",
+    }
+    | {f"magnetic_field_{axis}": "bias_magnetic" for axis in "xyz"}
+    | {f"rate_{axis}": "misalignment" for axis in "xyz"}
+)
 # What `compensate` adds is the output itself.
 NOT_DRIVERS = ("time", "output", "segment", "run", "position", "rate_estimated", "rate_estimated_std")
 
@@ -62,13 +79,23 @@ def driver_names(record: Record) -> tuple[str, ...]:
     return tuple(n for n in record.signals if not _is_no_driver(n) and not _unusable(record, n))
 
 
+def _usable(record: Record) -> dict[str, Array]:
+    """Signals less the columns that catalogue effects cannot take for their unit."""
+    return {n: v for n, v in record.signals.items() if of_usual_unit(n, record.units.get(n, usual_unit(n)))}
+
+
+def _is_owned(record: Record, name: str) -> bool:
+    """Whether a column's linear effect on the bias has another name than the column's."""
+    return name in OWN_EFFECTS or (name in OWNERS and of_usual_unit(name, record.units[name]))
+
+
 def _is_no_driver(name: str) -> bool:
     return name in NOT_DRIVERS or bool(DERIVED.fullmatch(name))
 
 
 def build_bank(record: Record) -> Bank:
     """Lay out the search for a record."""
-    signals = record.signals
+    signals = _usable(record)
     blocks: list[tuple[str, Literal["effect", "driver"], np.ndarray, Effect | None]] = []
     not_testable: dict[str, str] = {}
     scans = []
@@ -90,16 +117,15 @@ def build_bank(record: Record) -> Bank:
             if not forms:
                 not_testable[name] = kind.untested
             blocks.extend((name, "effect", _weighted(e, signals, rate), e) for e in forms)
-    plain = [n for n in driver_names(record) if n not in OWN_EFFECTS]
     for name in record.signals:
         reason = "" if _is_no_driver(name) else _unusable(record, name)
         if reason:
             not_testable |= {f"smooth({name})": reason} | (
-                {} if name in OWN_EFFECTS else {BiasColumn(column=name).label: reason}
+                {} if _is_owned(record, name) else {BiasColumn(column=name).label: reason}
             )
-    for name in plain:
-        effect = BiasColumn(column=name).prepared(signals)
-        blocks.append((effect.label, "effect", _weighted(effect, signals, rate), effect))
+    for name in [n for n in driver_names(record) if not _is_owned(record, n)]:
+        effect = BiasColumn(column=name).prepared(record.signals)
+        blocks.append((effect.label, "effect", _weighted(effect, record.signals, rate), effect))
     for name, shape in _smooths(record):
         blocks.append((name, "driver", shape, None))
     blocks.sort(key=lambda b: b[2].shape[1])
@@ -119,9 +145,10 @@ def _structure(name: str, effect: Effect | None, width: int) -> str:
 
 
 def _missing(kind: type[Effect], record: Record) -> str:
+    usable = _usable(record)
     for name in kind.needs:
-        if lacking((name,), record.signals):
-            return f"needs a column {name}"
+        if lacking((name,), usable):
+            return f"needs a column {name}" + (f" in a unit like {usual_unit(name)}" if name in record.signals else "")
         if name in record.signals and (reason := _unusable(record, name)):
             return reason
     return ""

@@ -12,12 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from gyromodel._checks import thermometers
+from gyromodel._checks import accelerations, thermometers
 
 Signals = Mapping[str, Float[Array, " sample"]]
 Site = Literal["gain", "scale", "rate"]
-# In `needs`: any thermometer besides `temperature`.
-SECOND_THERMOMETER = "temperature_<place>"
+# In `needs`: any thermometer besides `temperature`, and any column of specific force. Columns of which one is enough
+# are joined by " or ".
+SECOND_THERMOMETER, ANY_ACCELERATION = "temperature_<place>", "acceleration_<axis>"
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,8 @@ class Effect(eqx.Module):
     without it.
     `supersedes` lists effects that this one contains as a special case; `held` the fields that physics
     or the search fixes; `positive` says that the (only) coefficient cannot be negative; `scan` names a fast search over
-    every epoch or frequency; `untested` says why a campaign leaves it no `candidates`.
+    every epoch or frequency; `untested` says why a campaign leaves it no `candidates`; `remembers` that a sample's
+    contribution depends on its neighbours in time.
     """
 
     id: ClassVar[str]
@@ -77,6 +79,7 @@ class Effect(eqx.Module):
     positive: ClassVar[bool] = False
     scan: ClassVar[Literal["", "step", "line"]] = ""
     untested: ClassVar[str] = "its driver does not vary"
+    remembers: ClassVar[bool] = False
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -159,8 +162,8 @@ class Effect(eqx.Module):
 
 def lacking(needed: Iterable[str], signals: Signals) -> list[str]:
     """Columns needed that the signals lack; temperature_<place> stands for any second thermometer."""
-    second = len(thermometers(signals)) > 1
-    return [name for name in needed if name not in signals and not (name == SECOND_THERMOMETER and second)]
+    groups = {SECOND_THERMOMETER: len(thermometers(signals)) > 1, ANY_ACCELERATION: bool(accelerations(signals))}
+    return [each for each in needed if not any(groups.get(n, n in signals) for n in each.split(" or "))]
 
 
 @eqx.filter_jit

@@ -44,7 +44,7 @@ def as_c(calibration: Calibration) -> str:
     members = _members(model)
     for effect in model.effects:
         try:
-            reached = _lowered(GyroModel((effect,)), members)[1]
+            reached = {NEIGHBOUR} if effect.remembers else _lowered(GyroModel((effect,)), members)[1]
         except NoCForm as problem:
             raise ModelError(
                 f"effect {effect.label} cannot be exported to C, which has no short form of {problem}"

@@ -10,6 +10,7 @@ import numpy as np
 from .designs import Design
 from .effects import EFFECTS, UNKNOWN, draw_shape, error
 from .mde import amplitude, baseline
+from .motion import LAGS
 from .noise import Noise
 
 Array = np.ndarray
@@ -18,13 +19,22 @@ A, B, C = "rate_temperature", "static_cycle", "rate_steps"
 _TIME = ("bias_drift", "bias_step", "bias_warmup", "bias_periodic")
 _SCALE = ("scale_factor", "scale_asymmetry", "scale_nonlinearity", "scale_sagnac_sine")
 _THERMAL = ("bias_temperature", "bias_temperature_curve")
+_FORCE = ("bias_acceleration_input", "bias_acceleration_spin", "bias_acceleration_output", "bias_acceleration_squared")
 TESTABLE: dict[str, tuple[str, ...]] = {  # catalogue effects that each design can show
     A: (*_SCALE, "scale_temperature", "scale_temperature_curve", "bias", *_THERMAL, *_TIME, "bias_supply_voltage"),
     B: ("bias", *_THERMAL, "bias_temperature_rate", *_TIME, "bias_supply_voltage", "bias_pressure",
         "bias_laser_current"),
     C: (*_SCALE, "scale_temperature", "bias", "bias_temperature", *_TIME),
     "static_ramp": ("bias_temperature", "bias_drift"),
+    "tumble": (*_FORCE, "misalignment", "scale_factor", "bias_temperature"),
+    "turntable": ("table_tilt", "bias_magnetic", "table_harmonic", "scale_factor", "scale_asymmetry",
+                  "bias_temperature"),
+    "dynamic_rates": ("bias_vibration", "bias_anisoinertia", "misalignment", "output_axis_acceleration", "time_delay",
+                      "bandwidth", "scale_factor", "bias_temperature"),
+    "one_axis_tumble": ("misalignment", "bias_acceleration_input", "bias_acceleration_spin"),
+    "one_field": ("table_tilt", "bias_magnetic", "table_harmonic"),
 }  # fmt: skip
+MOTION = ("tumble", "turntable", "dynamic_rates")
 UNCATALOGUED: dict[str, tuple[str, ...]] = {
     A: ("temperature_ripple", "rate_ripple", "supply_voltage_ripple", "rate_temperature_bump"),
     B: ("temperature_ripple", "supply_voltage_ripple", "pressure_bump", "pressure_switch"),
@@ -61,8 +71,8 @@ def hide(
     if effect is not None:
         shape = draw_shape(effect, design, rng)
         size = float(rng.choice([-1, 1])) * amplitude(effect, design, noise, shape, times_mde)
-        if effect == "scale_sagnac_sine":
-            size = abs(size)  # a phase has no second sign
+        if effect in ("scale_sagnac_sine", *LAGS):
+            size = abs(size)  # a phase has no second sign, nor has a lag
         wrong = error(effect, design, size, shape)
     drawn = noise.sample(design, rng)
     output = design.true["rate"] * (1 + scale_error) + (wrong + bias) * (1 + scale_error) + drawn

@@ -15,6 +15,7 @@ from .campaigns import TESTABLE
 from .designs import Design
 from .effects import error
 from .mde import Oracle, baseline
+from .motion import BASIS, SMALL
 
 Array = np.ndarray
 Library = dict[str, Array]
@@ -30,6 +31,9 @@ def _signals(name: str, design: Design) -> Array:
     time = design.true["time"]
     span = np.ptp(time)
     shapes: list[dict[str, object]] = [{}]
+    if name in BASIS:
+        size = SMALL.get(name, 1.0)
+        return np.stack([error(name, design, size, shape) for shape in BASIS[name]], axis=-1)[:, None]
     match name:
         case "scale_nonlinearity":
             return np.stack([error(name, design, 1.0, {"mix": row}) for row in np.eye(4)], axis=-1)[:, None]
@@ -45,7 +49,7 @@ def _signals(name: str, design: Design) -> Array:
             shapes = [{"tau": tau * span} for tau in np.geomspace(0.04, 0.3, 12)]
         case "bias_step":
             shapes = [{"at": at} for at in 0.5 * (time[1:] + time[:-1])[len(time) // 12 : -(len(time) // 12)]]
-    size = 0.3 / np.abs(design.true["rate"]).max() if name == "scale_sagnac_sine" else 1.0
+    size = 0.3 / np.abs(design.true["rate"]).max() if name == "scale_sagnac_sine" else SMALL.get(name, 1.0)
     return np.stack([error(name, design, size, shape) for shape in shapes], axis=1)[:, :, None]
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter
@@ -25,6 +26,8 @@ class Design:
     metadata: dict[str, str | int | float]
     true: dict[str, Array]
     thermal: tuple[Array, Array]  # fine time, temperature
+    grade: float = 1.0  # of the gyro's noise, beside a usual one's
+    motion: Mapping[str, Any] | None = None  # rates by axis as functions of time, where they are known between samples
 
     @property
     def rotates(self) -> bool:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from .designs import Design
+from .motion import MOTION_EFFECTS, MOTION_SHAPES
 
 Array = np.ndarray
 Effect = Callable[..., Array]
@@ -182,7 +183,7 @@ EFFECTS: dict[str, Effect] = {
         scale_sagnac_sine, bias, bias_temperature, bias_temperature_curve, bias_temperature_rate,
         bias_drift, bias_step, bias_warmup, bias_periodic,
     )
-} | {f"bias_{c}": _linear(c) for c in ("supply_voltage", "pressure", "laser_current")}  # fmt: skip
+} | {f"bias_{c}": _linear(c) for c in ("supply_voltage", "pressure", "laser_current")} | MOTION_EFFECTS  # fmt: skip
 
 UNKNOWN: dict[str, tuple[Effect, tuple[str, ...]]] = {  # effect and the columns it follows
     **{f"{c}_ripple": (_ripple(c), (c,)) for c in ("temperature", "rate", "supply_voltage")},
@@ -231,7 +232,7 @@ SHAPES: dict[str, Callable[[Design, np.random.Generator], dict[str, Any]]] = {
         "at": (rng.uniform(0.25, 0.75), rng.uniform(0.25, 0.75)),
         "width": rng.uniform(0.12, 0.2),
     },
-}
+} | MOTION_SHAPES
 
 
 def draw_shape(name: str, design: Design, rng: np.random.Generator) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from scipy.optimize import root_scalar
 
 from .designs import Design
 from .effects import SCANS, error
+from .motion import BRACKETS, SMALL
 from .noise import Noise
 
 Array = np.ndarray
@@ -68,11 +69,15 @@ def amplitude(effect: str, design: Design, noise: Noise, shape: dict[str, Any], 
     """Amplitude that puts an effect at `times_mde` times its minimal detectable size."""
     judge = oracle(design, noise, baseline(design, effect) + simpler(effect))
     wanted = times_mde * target(effect)
-    if effect == "scale_sagnac_sine":  # the only one not linear in its amplitude: error ~ amplitude^2
+    brackets = BRACKETS
+    if effect == "scale_sagnac_sine":
         full = np.abs(design.true["rate"]).max()
+        brackets = {effect: (1e-4 / full, 1.5 / full)}
+    if effect in brackets:  # not linear in its amplitude
 
         def excess(log_size: float) -> float:
             return judge.norm(error(effect, design, np.exp(log_size), shape)) - wanted
 
-        return float(np.exp(root_scalar(excess, bracket=(np.log(1e-4 / full), np.log(1.5 / full))).root))
-    return wanted / judge.norm(error(effect, design, 1.0, shape))
+        return float(np.exp(root_scalar(excess, bracket=np.log(brackets[effect])).root))
+    small = SMALL.get(effect, 1.0)
+    return wanted * small / judge.norm(error(effect, design, small, shape))

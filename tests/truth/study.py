@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from itertools import cycle
 from multiprocessing import get_context
 from typing import Any
 
@@ -14,9 +15,11 @@ import numpy as np
 from scipy.stats import beta, binom
 
 from . import contest
-from .campaigns import TESTABLE, UNCATALOGUED, A, B, C, Truth, hide, known
+from .campaigns import MOTION, TESTABLE, UNCATALOGUED, A, B, C, Truth, hide, known
 from .designs import DESIGNS, Design
 from .mde import oracle
+from .motion import MOTION_EFFECTS
+from .motion_designs import MOTION_DESIGNS
 from .noise import FAMILY, OUTSIDE, Noise, draw
 from .verdicts import Answer, Score, judge
 
@@ -68,7 +71,7 @@ class Record:
 def build(case: Case) -> Built:
     """Simulate a case."""
     rng = np.random.default_rng(case.seed)
-    design = DESIGNS[case.design](rng)
+    design = (DESIGNS | MOTION_DESIGNS)[case.design](rng)
     noise = draw(case.noise, design, rng)
     return Built(*hide(case.effect, design, noise, case.times_mde, rng), design, noise)
 
@@ -161,6 +164,18 @@ def inseparable_cases(count: int, seed: int) -> list[Case]:
 def drift_cases(count: int, seed: int) -> list[Case]:
     """A pure drift under random walk."""
     return [Case(s, (A, B, C)[i % 3], "random_walk", "bias_drift", 3.0) for i, s in enumerate(_seeds(seed, count))]
+
+
+def motion_cases(count: int, seed: int, times_mde: float, noises: Iterable[str] = FAMILY[:2]) -> list[Case]:
+    """Effects of specific force, field, geometry and time, each in its designs and noises in turn."""
+    cells = [(d, e, n) for n in noises for d in MOTION for e in TESTABLE[d] if e in MOTION_EFFECTS]
+    return [Case(s, d, n, e, times_mde) for s, (d, e, n) in zip(_seeds(seed, count), cycle(cells), strict=False)]
+
+
+def motion_nulls(count: int, seed: int, noises: Iterable[str] = FAMILY) -> list[Case]:
+    """Nothing hidden in the campaigns that move the gyro."""
+    cells = [(d, n) for n in noises for d in MOTION]
+    return [Case(s, d, n) for s, (d, n) in zip(_seeds(seed, count), cycle(cells), strict=False)]
 
 
 def _in_turn(

@@ -1,0 +1,206 @@
+"""Effects of how fast the rate changes: delay, bandwidth, and the angular acceleration across the input axis.
+
+They look at neighbouring samples, and take each stretch between gaps by itself.
+"""
+
+from __future__ import annotations
+
+from typing import Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from gyromodel.effects._base import Effect, Signals, parameter, stack
+
+# A step in time this many times the usual one begins another stretch.
+GAP = 10.0
+# Least correlation of one change of the rate with the next: below it the rate is not followed between samples.
+RESOLVED = 0.5
+# Delays and lags searched, in sample intervals: where only their product with the slope shows, to many.
+SHORTEST, LONGEST, STEPS = 0.01, 32.0, 24
+
+
+class TimeDelay(Effect):
+    """I += ω(t − δ) − ω(t): the output is late.
+
+    The search lets a share of the effect vary to have a linear coefficient, which for a small delay is −δ dω/dt; the
+    fit holds it at one. Between samples the rate is a cubic through the four around.
+    """
+
+    id = "time_delay"
+    site = "rate"
+    needs = ("rate",)
+    cause = "Computing, filtering or transmission makes the output late, or clocks of gyro and table differ."
+    test = "Sweep the rate over a decade of frequency or more: the phase of a delay grows on, that of a lag levels off."
+    held = ("share",)
+    untested = "the rate does not change, or in steps between which it is not known"
+    remembers = True
+
+    share: Float[Array, ""] = parameter("1", 1.0, "part of the output that is late", default=1.0)
+    delay: Float[Array, ""] = parameter("ms", 1.0, "by how much", linear=False)
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """ω(t − δ) − ω(t)."""
+        return stack(earlier(signals["time"], signals["rate"], self.delay) - signals["rate"])
+
+    def settled(self) -> Self:
+        """All of the output is late, by as much as has the same slope."""
+        return type(self)(share=jnp.ones(()), delay=self.share * self.delay)
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """Delays from a part of the sample interval to many; a negative share of a small one is an early output."""
+        if not resolved(signals):
+            return []
+        return [cls(delay=d) for d in _interval(signals) * np.geomspace(SHORTEST, LONGEST, STEPS)]
+
+
+class Bandwidth(Effect):
+    """I += y − ω with τ dy/dt + y = ω: the output follows the rate through a first-order lag.
+
+    The search lets a share of the effect vary to have a linear coefficient, which for a small time constant is
+    −τ dω/dt; the fit holds it at one. Between samples the rate is a straight line.
+    """
+
+    id = "bandwidth"
+    site = "rate"
+    needs = ("rate",)
+    cause = "The loop or an output filter follows the rate with a limited bandwidth, 1/(2πτ)."
+    test = "Sweep the rate over a decade of frequency or more: beyond 1/(2πτ) a lag attenuates, a delay does not."
+    held = ("share",)
+    positive = True
+    untested = "the rate does not change, or in steps between which it is not known"
+    remembers = True
+
+    share: Float[Array, ""] = parameter("1", 1.0, "part of the output that lags", default=1.0)
+    time_constant: Float[Array, ""] = parameter("ms", 1.0, "τ of the lag", linear=False, default=1e-3)
+
+    def __check_init__(self) -> None:
+        if self.time_constant <= 0:
+            raise ValueError("a time constant is above zero")
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """y − ω."""
+        return stack(lagged(signals["time"], signals["rate"], self.time_constant) - signals["rate"])
+
+    def settled(self) -> Self:
+        """All of the output lags, by as much as has the same slope."""
+        return type(self)(share=jnp.ones(()), time_constant=jnp.maximum(self.share, 1e-6) * self.time_constant)
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """Time constants from a part of the sample interval to many."""
+        if not resolved(signals):
+            return []
+        return [cls(time_constant=t) for t in _interval(signals) * np.geomspace(SHORTEST, LONGEST, STEPS)]
+
+
+class OutputAxisAcceleration(Effect):
+    """I += c α_O: angular acceleration about the output axis, dω_O/dt."""
+
+    id = "output_axis_acceleration"
+    site = "rate"
+    needs = ("rate_output",)
+    cause = "The float's inertia about the output axis: its case turns away under it."
+    test = "Turn about the output axis alone, with changing rate: a delay needs rates about the input axis."
+    remembers = True
+    untested = "the rate about the output axis does not change, or in steps between which it is not known"
+
+    coefficient: Float[Array, ""] = parameter("ms", 1.0, "I_O/H: input rate per angular acceleration")
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """dω_O/dt."""
+        return stack(slope(signals["time"], signals["rate_output"]))
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """Itself, where the rate about the output axis is followed from sample to sample."""
+        return [cls()] if resolved(signals, "rate_output") else []
+
+
+def _interval(signals: Signals) -> float:
+    step = np.diff(np.asarray(signals["time"]))
+    return float(np.median(step[step > 0]))
+
+
+def resolved(signals: Signals, name: str = "rate") -> bool:
+    """Whether a rate changes from sample to sample in a way that tells what it does between them."""
+    change = np.diff(np.asarray(signals[name]))[np.diff(np.asarray(signals["time"])) > 0]
+    if not np.ptp(change) > 0:
+        return False
+    return bool(np.corrcoef(change[1:], change[:-1])[0, 1] > RESOLVED)
+
+
+def _clock(
+    time: Float[Array, " sample"],
+) -> tuple[Float[Array, " sample"], Int[Array, " sample"], Int[Array, " sample"]]:
+    """Time that always rises, and the first and last row of the stretch that each row lies in."""
+    step = jnp.diff(time)
+    # Padding repeats the last time and would hide the usual step; a new run begins again at zero.
+    usual = jnp.nanmedian(jnp.where(step > 0, step, jnp.nan))
+    starts = jnp.concatenate([jnp.ones(1, bool), (step <= 0) | (step > GAP * usual)])
+    rows = jnp.arange(len(time))
+    first = jax.lax.cummax(jnp.where(starts, rows, 0))
+    last = jax.lax.cummin(jnp.where(jnp.concatenate([starts[1:], jnp.ones(1, bool)]), rows, len(time)), reverse=True)
+    rising = jnp.concatenate([jnp.zeros(1), jnp.cumsum(jnp.where(step > 0, step, usual))])
+    return rising, first, last
+
+
+def earlier(
+    time: Float[Array, " sample"], values: Float[Array, " sample"], delay: Float[Array, ""]
+) -> Float[Array, " sample"]:
+    """Values a delay before each sample, by the cubic through the four samples around; held at a stretch's ends."""
+    clock, first, last = _clock(time)
+    wanted = clock - delay
+    wanted = jnp.clip(wanted, clock[first], clock[last])
+    left = jnp.clip(jnp.searchsorted(clock, wanted, side="right") - 1, first, jnp.maximum(last - 1, first))
+    start = jnp.clip(left - 1, first, jnp.maximum(last - 3, first))
+    rows = start[:, None] + jnp.arange(4)
+    inside = rows <= last[:, None]
+    rows = jnp.minimum(rows, last[:, None])
+    places = clock[rows] - clock[start][:, None]
+    at = wanted - clock[start]
+    weights = []
+    for j in range(4):
+        weight = inside[:, j].astype(float)
+        for k in {0, 1, 2, 3} - {j}:
+            factor = (at - places[:, k]) / _apart(places[:, j] - places[:, k])
+            weight = weight * jnp.where(inside[:, k], factor, 1.0)
+        weights.append(weight)
+    return jnp.sum(stack(*weights) * values[rows], axis=1)
+
+
+def _apart(difference: Array) -> Array:
+    return jnp.where(difference == 0, 1.0, difference)
+
+
+def lagged(
+    time: Float[Array, " sample"], values: Float[Array, " sample"], time_constant: Float[Array, ""]
+) -> Float[Array, " sample"]:
+    """Output of a first-order lag for straight lines between the samples; it begins each stretch in step with them."""
+    clock, first, _ = _clock(time)
+    step = jnp.diff(clock, prepend=clock[0] - 1.0)
+    begins = first == jnp.arange(len(time))
+    decay = jnp.where(begins, 0.0, jnp.exp(-step / time_constant))
+    ratio = time_constant / step
+    before = jnp.concatenate([values[:1], values[:-1]])
+    drive = (1.0 - ratio * (1.0 - decay)) * values + (ratio * (1.0 - decay) - decay) * before
+    drive = jnp.where(begins, values, drive)
+
+    def both(a, b):
+        return a[0] * b[0], b[0] * a[1] + b[1]
+
+    return jax.lax.associative_scan(both, (decay, drive))[1]
+
+
+def slope(time: Float[Array, " sample"], values: Float[Array, " sample"]) -> Float[Array, " sample"]:
+    """Derivative by time: of the parabola through a sample and its neighbours, of a line at the ends of a stretch."""
+    clock, first, last = _clock(time)
+    rows = jnp.arange(len(time))
+    before, after = jnp.maximum(rows - 1, first), jnp.minimum(rows + 1, last)
+    back, ahead = clock - clock[before], clock[after] - clock
+    down, up = (values - values[before]) / _apart(back), (values[after] - values) / _apart(ahead)
+    inside = (down * ahead + up * back) / _apart(back + ahead)
+    return jnp.where(back == 0, up, jnp.where(ahead == 0, down, inside))

@@ -1,0 +1,224 @@
+"""Effects of how the gyro stands: its axes, the table under it, and the field around it.
+
+Amplitudes are components, so that no start value is needed for a direction: north and east, cosine and sine.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from typing import Self
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from gyromodel._checks import along_axes
+from gyromodel.effects._base import Effect, Signals, parameter, stack
+
+# Harmonics of the table angle that are searched.
+HARMONICS = (1, 2, 3, 4)
+
+
+def cross_rates(signals: Signals) -> list[str]:
+    """The rates about the two axes across the input axis, by column; those of the two other axes of three."""
+    return along_axes("rate", signals)
+
+
+def angle_column(signals: Signals, *names: str) -> str:
+    """The first of some angles that varies; else the first that is there, or the first."""
+    there = [n for n in names if n in signals]
+    return next((n for n in there if np.ptp(np.asarray(signals[n])) > 0), [*there, names[0]][0])
+
+
+def varying(signals: Signals, names: list[str]) -> list[str]:
+    """The columns that vary."""
+    return [n for n in names if np.ptp(np.asarray(signals[n])) > 0]
+
+
+class Misalignment(Effect):
+    """I += Θ_S ω_S + Θ_O ω_O: the input axis leans towards the two others by small angles.
+
+    In terms of rotations about x and y of a gyro whose input axis is z: Θ_y ω_x − Θ_x ω_y. `about` names the columns of
+    the cross rates; if empty, all that the campaign has.
+    """
+
+    id = "misalignment"
+    site = "rate"
+    needs = ("rate_spin or rate_output or rate_x or rate_y or rate_z",)
+    cause = "The input axis is not where the mounting faces say, so that rates about the other axes are sensed."
+    test = "Turn about the other axes at rates far above the Earth's: what follows specific force stays as it is."
+    untested = "the rates about the other axes do not vary"
+
+    angles: Float[Array, " axis"] = parameter("arcsec", 60.0, "lean of the input axis towards each axis", default=())
+    about: tuple[str, ...] = eqx.field(static=True, default=("",))
+
+    def __post_init__(self) -> None:
+        if np.size(self.angles) == 0:
+            self.angles = jnp.zeros(len(self.about))
+
+    def __check_init__(self) -> None:
+        if self.angles.shape != (len(self.about),):
+            raise ValueError("about names one rate for each angle")
+
+    @property
+    def columns_needed(self) -> tuple[str, ...]:
+        """The cross rates."""
+        return self.about if any(self.about) else self.needs
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """The cross rates."""
+        return stack(*(signals[name] for name in self.about))
+
+    def prepared(self, signals: Signals) -> Self:
+        """Take all cross rates that vary."""
+        names = cross_rates(signals)
+        return self if any(self.about) else type(self)(about=tuple(varying(signals, names) or names[:1]))
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """Each cross rate, and both."""
+        names = varying(signals, cross_rates(signals))
+        return [cls(about=s) for n in (1, 2) for s in itertools.combinations(names, n)]
+
+
+class TableTilt(Effect):
+    """I += A_N cos Ψ + A_E sin Ψ, Ψ the azimuth: Earth's horizontal rate through a tilt.
+
+    A tilt of the input axis by θ from the axis of the table, or of the table from the vertical, senses θ times the
+    Earth's horizontal rate, 15.04 deg/h · cos(latitude): the amplitudes over that rate are the tilt in radians.
+    """
+
+    id = "table_tilt"
+    site = "rate"
+    needs = ("azimuth or table_angle",)
+    cause = "The input axis or the table leans, and the Earth's horizontal rate enters as the gyro turns in azimuth."
+    test = "Reverse the magnetic field around the gyro, or shield it: a tilt stays, a magnetic bias does not."
+
+    north: Float[Array, ""] = parameter("deg/h", 0.01, "part that follows the cosine of azimuth")
+    east: Float[Array, ""] = parameter("deg/h", 0.01, "part that follows the sine")
+    angle: str = eqx.field(static=True, default="")
+
+    @property
+    def columns_needed(self) -> tuple[str, ...]:
+        """The angle."""
+        return (self.angle,) if self.angle else self.needs
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """Cosine and sine of the azimuth."""
+        return stack(jnp.cos(signals[self.angle]), jnp.sin(signals[self.angle]))
+
+    def prepared(self, signals: Signals) -> Self:
+        """Take the azimuth; the table angle where there is none that varies."""
+        if self.angle:
+            return self
+        return dataclasses.replace(self, angle=angle_column(signals, "azimuth", "table_angle"))
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """The one angle, if it varies."""
+        effect = cls().prepared(signals)
+        return [effect] if varying(signals, [effect.angle]) else []
+
+
+class TableHarmonic(Effect):
+    """I += Σ c_k cos kΘ + s_k sin kΘ, Θ the table angle: what returns with each turn of the table."""
+
+    id = "table_harmonic"
+    site = "rate"
+    needs = ("table_angle",)
+    cause = "The table's bearing, encoder or drive, or stray fields along its turn, repeat with its angle."
+    test = "Turn the gyro on the table by 90°: what comes from the table stays, what comes from the gyro moves along."
+
+    cosine: Float[Array, " order"] = parameter("deg/h", 0.1, "in-phase amplitude of each harmonic", default=())
+    sine: Float[Array, " order"] = parameter("deg/h", 0.1, "quadrature amplitude of each harmonic", default=())
+    orders: tuple[int, ...] = eqx.field(static=True, default=HARMONICS)
+
+    def __post_init__(self) -> None:
+        self.cosine, self.sine = (v if np.size(v) else jnp.zeros(len(self.orders)) for v in (self.cosine, self.sine))
+
+    def __check_init__(self) -> None:
+        if not self.orders or min(self.orders) < 1 or len(set(self.orders)) < len(self.orders):
+            raise ValueError("orders are different whole numbers from 1 on")
+        if not self.cosine.shape == self.sine.shape == (len(self.orders),):
+            raise ValueError("every order needs a cosine and a sine")
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """The cosines, then the sines."""
+        phase = signals["table_angle"][:, None] * jnp.asarray(self.orders, float)
+        return jnp.concatenate([jnp.cos(phase), jnp.sin(phase)], axis=1)
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """Each harmonic by itself, and all up to the second, third or fourth."""
+        each = [(k,) for k in HARMONICS]
+        return [cls(orders=o) for o in (*each, *(HARMONICS[:n] for n in (2, 3, 4)))]
+
+
+class BiasMagnetic(Effect):
+    """D += D_H H: bias proportional to a magnetic field, or, where none is measured, A cos Θ + B sin Θ.
+
+    Θ is the angle by which the gyro turns in a field that stands still, `angle` its column. With the field measured,
+    `field` names the columns of its components; if both are empty, what the campaign has.
+    """
+
+    id = "bias_magnetic"
+    site = "rate"
+    needs = ("magnetic_field or magnetic_field_x or magnetic_field_y or magnetic_field_z or table_angle or azimuth",)
+    cause = "Faraday rotation in a fiber coil, or a field on a motor, torquer or plasma."
+    test = "Reverse the magnetic field around the gyro, or shield it: a tilt stays, a magnetic bias does not."
+
+    coefficients: Float[Array, " component"] = parameter("deg/h/gauss", 1.0, "bias per unit of a component", default=())
+    cosine: Float[Array, " harmonic"] = parameter("deg/h", 0.1, "what follows the cosine of the angle", default=())
+    sine: Float[Array, " harmonic"] = parameter("deg/h", 0.1, "what follows its sine", default=())
+    field: tuple[str, ...] = eqx.field(static=True, default=("",))
+    angle: str = eqx.field(static=True, default="")
+
+    def __post_init__(self) -> None:
+        if np.size(self.coefficients) == 0 and any(self.field):
+            self.coefficients = jnp.zeros(len(self.field))
+        if np.size(self.cosine) == np.size(self.sine) == 0 and self.angle:
+            self.cosine = self.sine = jnp.zeros(1)
+
+    def __check_init__(self) -> None:
+        if self.coefficients.shape != (len(self.field) * any(self.field),):
+            raise ValueError("field names one column for each coefficient")
+        if not self.cosine.shape == self.sine.shape == (bool(self.angle) * 1,):
+            raise ValueError("an angle needs a cosine and a sine")
+
+    @property
+    def columns_needed(self) -> tuple[str, ...]:
+        """The components of the field, or the angle."""
+        named = tuple(n for n in (*self.field, self.angle) if n)
+        return named or self.needs
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """The components of the field, or cosine and sine of the angle."""
+        parts = [signals[n] for n in self.field if n]
+        if self.angle:
+            parts += [jnp.cos(signals[self.angle]), jnp.sin(signals[self.angle])]
+        return stack(*parts) if parts else jnp.zeros((signals["time"].shape[0], 0))
+
+    def prepared(self, signals: Signals) -> Self:
+        """Take the field where it is measured, else the angle."""
+        if any(self.field) or self.angle:
+            return self
+        names = _field(signals)
+        if names:
+            return type(self)(field=tuple(varying(signals, names) or names[:1]))
+        return type(self)(angle=angle_column(signals, "table_angle", "azimuth"))
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """Each component of the field that varies, all of them, or the angle."""
+        names = varying(signals, _field(signals))
+        if names:
+            sets = dict.fromkeys([*((n,) for n in names), tuple(names)])
+            return [cls(field=s) for s in sets]
+        effect = cls().prepared(signals)
+        return [effect] if effect.angle and varying(signals, [effect.angle]) else []
+
+
+def _field(signals: Signals) -> list[str]:
+    return ["magnetic_field"] if "magnetic_field" in signals else along_axes("magnetic_field", signals)
