@@ -31,8 +31,8 @@ from gyromodel.signals import Record, read_signals, with_columns_known
 from gyromodel.units import convertible, factor, from_internal
 
 FEWEST_DRAWS = 200
-# What a pose tells is in its mean: so many rows of all of them are enough.
-POSED_ROWS = 2_000
+# What a pose tells is in its mean: within it, means over so long (s) are enough, and keep out a hand's tremor.
+MEAN_OF_POSE = 1.0
 # Folds search the noise cells within this many nats of the best of the main pass.
 FOLD_NEARBY = 3.0
 
@@ -100,7 +100,7 @@ def diagnose(
         for c, posed in zip(given, campaigns, strict=True)
         if posed is not c
     ]
-    shortened = [average(c, *([] if c is g else [POSED_ROWS])) for c, g in zip(campaigns, given, strict=True)]
+    shortened = [average(c, seconds=MEAN_OF_POSE * (c is not g)) for c, g in zip(campaigns, given, strict=True)]
     if any(m > 1 for _, m in shortened):
         most = max(m for _, m in shortened)
         findings.append(
