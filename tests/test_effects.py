@@ -48,7 +48,7 @@ def signals_of(rng: np.random.Generator) -> dict[str, jax.Array]:
 
 def randomised(effect: Effect, signals: dict[str, jax.Array], rng: np.random.Generator) -> Effect:
     """Typical sizes with random factors; breakpoints inside and outside the range of temperatures met."""
-    if isinstance(effect, BiasTemperatureCurve) or effect.id == "scale_temperature_curve":
+    if isinstance(effect, BiasTemperatureCurve) or effect.id in ("scale_temperature_curve", "temperature_lag"):
         effect = type(effect)(coefficients=np.zeros(2), hinges=np.zeros(3), breakpoints=np.array([-60.0, 21.3, 90.0]))  # type: ignore[arg-type]
     effect = effect.prepared(signals)
     for name, declared in effect.declared().items():
@@ -185,6 +185,25 @@ BY_HAND = [
         {"coefficient": "1000 deg/h/(degC/s)"},
         {"temperature_rate": [0.01, -0.01]},
         [10.0, -10.0],
+    ),
+    (
+        "bias_temperature_product",
+        {"coefficient": "100 deg/h/(degC^2/s)", "reference": "20 degC"},
+        {"temperature": [30.0, 15.0], "temperature_rate": [0.01, -0.02]},
+        [10.0, 10.0],
+    ),
+    (
+        "temperature_lag",
+        {
+            "coefficients": ["1 deg/h", "2 deg/h"],
+            "hinges": ["3 deg/h/degC"],
+            "breakpoints": ["30 degC"],
+            "time_constant": "5 min",
+            "reference": "20 degC",
+        },
+        # three degrees ahead: 30, 33 and 17 degC
+        {"temperature": [27.0, 30.0, 20.0], "temperature_rate": [0.01, 0.01, -0.01]},
+        [3.0, 1.3 + 2 * 1.69 + 9.0, -0.3 + 2 * 0.09],
     ),
     (
         "bias_temperature_gradient",

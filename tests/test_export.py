@@ -48,7 +48,7 @@ def campaign(rng: np.random.Generator, *names: str) -> Campaign:
 def filled(label: str, record_signals: Signals, rng: np.random.Generator) -> Effect:
     """The effect at random values below its typical sizes."""
     effect = make_effect(label)
-    if label.endswith("_curve"):
+    if label.endswith("_curve") or label == "temperature_lag":
         effect = type(effect)(coefficients=np.zeros(3), hinges=np.zeros(2), breakpoints=np.array([20.0, 33.0]))  # type: ignore[call-arg]
     effect = effect.prepared(record_signals)
     values = {}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Literal, Self
 
@@ -64,7 +64,8 @@ class Effect(eqx.Module):
     without it.
     `supersedes` lists effects that this one contains as a special case; `held` the fields that physics
     or the search fixes; `positive` says that the (only) coefficient cannot be negative; `scan` names a fast search over
-    every epoch or frequency; `untested` says why a campaign leaves it no `candidates`.
+    every epoch or frequency; `untested` says why a campaign leaves it no `candidates`; `remembers` that it looks at
+    earlier samples; `reach` is the largest amplitude (internal units) of an effect that continues others.
     """
 
     id: ClassVar[str]
@@ -77,6 +78,8 @@ class Effect(eqx.Module):
     positive: ClassVar[bool] = False
     scan: ClassVar[Literal["", "step", "line"]] = ""
     untested: ClassVar[str] = "its driver does not vary"
+    remembers: ClassVar[bool] = False
+    reach: ClassVar[float] = np.inf
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -105,6 +108,14 @@ class Effect(eqx.Module):
     def candidates(cls, signals: Signals) -> list[Self]:
         """The forms the search tries, at zero amplitude: every variant, every grid point of nonlinear parameters."""
         return [cls().prepared(signals)]
+
+    @classmethod
+    def continuing(cls, effects: Sequence[Effect]) -> Self | None:
+        """The effect grown from those of a model, whose sum it is where its last nonlinear parameter is zero.
+
+        That parameter is then its amplitude. None where the model has nothing to grow from.
+        """
+        return None
 
     @classmethod
     def declared(cls) -> dict[str, Parameter]:

@@ -21,6 +21,8 @@ PHRASES = {
     "bias_temperature": "a bias proportional to temperature",
     "bias_temperature_curve": "a bias that curves with temperature",
     "bias_temperature_rate": "a temperature-rate bias",
+    "bias_temperature_product": "a temperature-rate bias that changes with temperature",
+    "temperature_lag": "a thermometer that is late",
     "bias_temperature_gradient": "a bias proportional to a temperature difference",
     "bias_temperature_gradient_rate": "a bias proportional to the rate of a temperature difference",
     "bias_warmup": "a warm-up bias",
