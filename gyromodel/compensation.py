@@ -18,7 +18,7 @@ from gyromodel._checks import thermometers
 from gyromodel.campaign import Campaign
 from gyromodel.effects import Signals
 from gyromodel.estimate import Calibration, check_covariates, validity_unit
-from gyromodel.model import GyroModel, check_units
+from gyromodel.model import GyroModel, ModelError, check_units
 from gyromodel.signals import Record, read_signals
 from gyromodel.units import from_internal
 
@@ -52,7 +52,7 @@ def compensate(campaign: Campaign, calibration: Calibration) -> Campaign:
 
     Raises:
         CampaignError: the campaign has several axes.
-        ModelError: the model needs a column that the campaign lacks, or is of other units.
+        ModelError: the model needs a column that the campaign lacks, is of other units, or remembers earlier rates.
     """
     record = read_signals(campaign)
     record = record._replace(signals=record.signals | {"rate": jnp.zeros_like(record.signals["time"])})
@@ -61,6 +61,12 @@ def compensate(campaign: Campaign, calibration: Calibration) -> Campaign:
     calibration = replace(calibration, model=model)
     check_covariates(record, model)
     check_units(model, record.output_unit, record.units)
+    for effect in model.effects:
+        if effect.remembers and "rate" in effect.columns_needed:
+            raise ModelError(
+                f"effect {effect.label} looks at earlier rates, so that no output gives its rate by itself: fix it at "
+                "zero or leave it out"
+            )
     rate, variance = _estimate(calibration, record)
     notes = _notes(campaign, calibration, record, rate, np.sqrt(variance))
     campaign = campaign.with_column("rate_estimated", from_internal(rate, "deg/s"), "deg/s")

@@ -39,6 +39,7 @@ def signals_of(rng: np.random.Generator) -> dict[str, jax.Array]:
         "temperature_rate": 0.05 * np.cos(time / 300),
         "temperature_coil": 20 + 14 * np.sin(time / 300 - 0.2),
         "temperature_coil_rate": 0.045 * np.cos(time / 300 - 0.2),
+        "run": np.repeat([3.0, 1.0, 4.0], [20, 20, ROWS - 40]),
         "pressure": 1e5 + 100 * rng.standard_normal(ROWS),
         "output": rng.standard_normal(ROWS),
     }
@@ -53,6 +54,8 @@ def randomised(effect: Effect, signals: dict[str, jax.Array], rng: np.random.Gen
     effect = effect.prepared(signals)
     for name, declared in effect.declared().items():
         if name == "breakpoints":
+            continue
+        if name == "runs":
             continue
         size = (
             declared.typical * factor(declared.unit, internal_unit(declared.unit)) if declared.unit != "degC" else 1.0
@@ -205,6 +208,26 @@ BY_HAND = [
         {"temperature": [27.0, 30.0, 20.0], "temperature_rate": [0.01, 0.01, -0.01]},
         [3.0, 1.3 + 2 * 1.69 + 9.0, -0.3 + 2 * 0.09],
     ),
+    (
+        # Play of ±2: 21, 25, 22, 19 and 20 drag along 21, 23, 23, 21 and 21; a new campaign starts afresh.
+        "bias_thermal_hysteresis",
+        {"height": "4 deg/h", "half_width": "2 degC"},
+        {"time": [0.0, 1, 2, 3, 4, 0, 1], "temperature": [21.0, 25, 22, 19, 20, 30, 29]},
+        [0.0, 4.0, -2.0, -4.0, -2.0, 0.0, -2.0],
+    ),
+    (
+        "rate_hysteresis",
+        {"height": "3 deg/h", "half_width": "0.1 rad/s"},
+        {"time": [0.0, 1, 2, 3], "rate": [0.5, 0.7, 0.65, 0.2]},
+        [0.0, 3.0, 1.5, -3.0],
+    ),
+    (
+        "bias_turn_on",
+        {"offsets": ["2 deg/h", "-1 deg/h"], "runs": ["7", "4"]},
+        {"run": [5.0, 4.0, 7.0, 7.0, 8.0]},
+        [0.0, -1.0, 2.0, 2.0, 0.0],
+    ),
+    ("scale_drift", {"slope": "20 ppm/h"}, {"time": [0.0, 1800.0, 7200.0]}, [0.0, 10.0, 40.0]),
     (
         "bias_temperature_gradient",
         {"coefficient": "2 deg/h/degC"},

@@ -30,7 +30,8 @@ from gyromodel.units import factor, internal_unit
 from tests.test_c_code import CC, STRICT
 
 ROWS = 150
-LABELS = [*sorted(set(CATALOGUE) - {"bias_column", "scale_factor"}), "bias_supply_voltage"]
+REMEMBER = sorted(name for name, kind in CATALOGUE.items() if kind.remembers)
+LABELS = [*sorted(set(CATALOGUE) - {"bias_column", "scale_factor", *REMEMBER}), "bias_supply_voltage"]
 needs_compiler = pytest.mark.skipif(CC is None, reason="no C compiler on this machine")
 SCALE = ScaleFactor(value=jnp.asarray(1500.0), unit="count/rad")
 
@@ -42,6 +43,8 @@ def campaign(rng: np.random.Generator, *names: str) -> Campaign:
     columns["temperature"], units["temperature"] = 25 + 15 * np.sin(columns["time"] / 300), "degC"
     for name in {name.replace("<place>", "coil") for name in names} - {"time", "rate", "temperature"}:
         columns[name], units[name] = rng.uniform(0.5, 1.5, ROWS), usual_unit(name)
+    if "run" in names:
+        columns["run"] = np.arange(ROWS) // 50
     return Campaign(columns, units, {"kind": "rate", "time_since_power_on": 40.0})
 
 
@@ -54,7 +57,7 @@ def filled(label: str, record_signals: Signals, rng: np.random.Generator) -> Eff
     values = {}
     for name, declared in effect.declared().items():
         # Bands of a dithered lock-in that overlap, as at random values, leave no rate to an output.
-        if name not in ("breakpoints", "time_constant", "share") and label != "lock_in_dithered":
+        if name not in ("breakpoints", "time_constant", "share", "runs") and label != "lock_in_dithered":
             size = declared.typical * factor(declared.unit, internal_unit(declared.unit)) if declared.linear else 1.0
             values[name] = size * jnp.asarray(rng.uniform(0.3, 1.0, np.shape(getattr(effect, name))))
     return replace(effect, **values)
@@ -173,6 +176,12 @@ class Differencing(BiasColumn):
 
     def columns(self, signals):
         return jnp.diff(signals[self.column], prepend=0.0)[:, None]
+
+
+@pytest.mark.parametrize("label", REMEMBER)
+def test_effects_that_remember_are_refused(label: str):
+    with pytest.raises(ModelError, match=f"{label} cannot be exported to C"):
+        export_calibration(Calibration(GyroModel((SCALE, make_effect(label)))), "c")
 
 
 @pytest.mark.parametrize(

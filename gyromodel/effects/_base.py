@@ -169,9 +169,13 @@ class Effect(eqx.Module):
 
 
 def lacking(needed: Iterable[str], signals: Signals) -> list[str]:
-    """Columns needed that the signals lack; temperature_<place> stands for any second thermometer."""
-    second = len(thermometers(signals)) > 1
-    return [name for name in needed if name not in signals and not (name == SECOND_THERMOMETER and second)]
+    """Columns needed that the signals lack.
+
+    temperature_<place> stands for any second thermometer; several campaigns are a run each.
+    """
+    known = {*signals, *([SECOND_THERMOMETER] if len(thermometers(signals)) > 1 else [])}
+    known |= {"run"} if "campaign" in signals else set()
+    return [name for name in needed if name not in known]
 
 
 @eqx.filter_jit
