@@ -9,7 +9,9 @@ import numpy as np
 
 from gyromodel._checks import thermometers
 from gyromodel.diagnosis._evidence import log_sum
-from gyromodel.diagnosis._scan import CellResult, Scanner
+from gyromodel.diagnosis._scan import CellResult, Scanner, Tangent
+from gyromodel.effects import CATALOGUE
+from gyromodel.effects._base import evaluate
 from gyromodel.effects.drivers import BiasColumn, BiasPeriodic
 from gyromodel.estimate import Estimate
 from gyromodel.model import GyroModel, effect_class
@@ -32,11 +34,13 @@ class Ranking:
     slow: dict[int, bool] = field(repr=False)
     walks: dict[int, bool] = field(repr=False)
     baseline_columns: np.ndarray = field(repr=False)
+    tangents: dict[str, Tangent] = field(default_factory=dict, repr=False)
 
     def best(self, *, drivers: bool, but: tuple[str, ...] = ()) -> tuple[str | None, float]:
         """The best unknown driver, or the best named candidate (but some), and its evidence ratio (ln)."""
         mine = {k: v for k, v in self.statistic.items() if is_driver(k) == drivers and k not in but}
-        top = max(mine, key=lambda k: mine[k]) if mine else None
+        # Of names that are the same on this campaign the first, whatever the rounding.
+        top = max(mine, key=lambda k: round(mine[k], 6)) if mine else None
         return top, mine[top] if top else -np.inf
 
     @property
@@ -112,11 +116,17 @@ def rank(
         for b in scanner.bank.blocks
         if b.effect is not None and b.effect.supersedes
     }
+    continued = tangents(scanner, estimate.model, skip)
     families = scanner.noise_families() if estimate.noise_given else {}
     wanted = sorted({*cells, *(g for f in families.values() for g in f)})
     everything = dict(known or {})
     everything |= scanner.run(
-        [g for g in wanted if g not in everything], columns, residual, contained, line_frequencies(estimate.model)
+        [g for g in wanted if g not in everything],
+        columns,
+        residual,
+        contained,
+        line_frequencies(estimate.model),
+        list(continued.values()),
     )
     results = {g: everything[g] for g in cells}
     prior = scanner.grid.log_prior
@@ -141,7 +151,17 @@ def rank(
     walk, flicker = scanner.grid.ratios.walk, scanner.grid.ratios.flicker
     slow = {g: float(walk[g]) > 0 or float(flicker[g]) > 0 for g in cells}
     walks = {g: float(walk[g]) > 0 for g in cells}
-    return Ranking(statistic, posterior, results, prior, slow, walks, columns)
+    return Ranking(statistic, posterior, results, prior, slow, walks, columns, continued)
+
+
+def tangents(scanner: Scanner, model: GyroModel, skip: set[str]) -> dict[str, Tangent]:
+    """Candidates that continue effects of a model, where nothing but their absence keeps them from being searched."""
+    found = {}
+    for name, kind in CATALOGUE.items():
+        effect = kind.continuing(model.effects) if scanner.bank.not_testable.get(name) == kind.untested else None
+        if effect is not None and name not in skip:
+            found[name] = Tangent(effect, np.asarray(evaluate(effect, scanner.record.signals)[1][:, -1]))
+    return found
 
 
 def rank_where_it_matters(scanner: Scanner, estimate: Estimate, pulses: tuple[int, ...]) -> Ranking:

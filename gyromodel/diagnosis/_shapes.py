@@ -29,6 +29,8 @@ def _columns(scanner: Scanner, ranking: Ranking, name: str) -> np.ndarray | None
         marks = np.zeros((len(scanner.present), len(rows)))
         marks[list(rows), np.arange(len(rows))] = 1.0
         return marks
+    if name in ranking.tangents:
+        return ranking.tangents[name].column[:, None]
     assert isinstance(form, int)
     effect = form_effect(scanner, name, form)
     if name in ("bias_step", "bias_periodic"):
@@ -147,6 +149,12 @@ def minimum_detectable(scanner: Scanner, ranking: Ranking, threshold: float, uni
         q = widths[name].width if name in widths else (2 if name == "bias_periodic" else 1)
         needed = np.sqrt(explained_for(threshold + np.log(len(energy)), nu, q)) + 0.84
         size = float(needed * sigma / np.sqrt(np.median(energy)))
+        if name in ranking.tangents:
+            kind = ranking.tangents[name].effect
+            unit_of = [p.unit for p in kind.declared().values() if not p.linear][-1]
+            size = float(needed * sigma / np.sqrt(energy[0]))
+            sizes[name] = size * factor(internal_unit(unit_of), unit_of), unit_of
+            continue
         sizes[name] = _in_unit(scanner, name, widths[name].effect if name in widths else None, q, size, unit)
     return sizes
 
@@ -162,10 +170,12 @@ def _in_unit(scanner: Scanner, name: str, effect: Effect | None, q: int, size: f
 
 
 def not_testable(scanner: Scanner, ranking: Ranking, model: GyroModel) -> dict[str, str]:
-    """Candidates that a model does not have and whose columns vanish beside it, with the reason."""
+    """Candidates that a campaign cannot show, and those whose columns vanish beside a model, with the reason."""
     result = ranking.results[ranking.best_cell()]
-    return {
+    tried = {b.name for b in scanner.bank.blocks if b.kind == "effect"} | set(ranking.tangents)
+    reasons = {k: v for k, v in scanner.bank.not_testable.items() if k not in (*tried, *model.labels)}
+    return reasons | {
         name: "cannot be told from what the model already has on this campaign"
-        for name in {b.name for b in scanner.bank.blocks if b.kind == "effect"} - skipped(model, scanner.record.signals)
+        for name in tried - skipped(model, scanner.record.signals)
         if name not in result.evidence and not (result.energy.get(name, np.zeros(1)) > 0).any()
     }

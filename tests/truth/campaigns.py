@@ -15,16 +15,18 @@ from .noise import Noise
 
 Array = np.ndarray
 
-A, B, C = "rate_temperature", "static_cycle", "rate_steps"
+A, B, C, RUNS = "rate_temperature", "static_cycle", "rate_steps", "repeated_runs"
 _TIME = ("bias_drift", "bias_step", "bias_warmup", "bias_periodic")
 _SCALE = ("scale_factor", "scale_asymmetry", "scale_nonlinearity", "scale_sagnac_sine")
 _THERMAL = ("bias_temperature", "bias_temperature_curve")
 _FORCE = ("bias_acceleration_input", "bias_acceleration_spin", "bias_acceleration_output", "bias_acceleration_squared")
 TESTABLE: dict[str, tuple[str, ...]] = {  # catalogue effects that each design can show
-    A: (*_SCALE, "scale_temperature", "scale_temperature_curve", "bias", *_THERMAL, *_TIME, "bias_supply_voltage"),
+    A: (*_SCALE, "scale_temperature", "scale_temperature_curve", "bias", *_THERMAL, *_TIME, "bias_supply_voltage",
+        "scale_drift", "rate_hysteresis"),
     B: ("bias", *_THERMAL, "bias_temperature_rate", *_TIME, "bias_supply_voltage", "bias_pressure",
-        "bias_laser_current"),
-    C: (*_SCALE, "scale_temperature", "bias", "bias_temperature", *_TIME),
+        "bias_laser_current", "bias_temperature_product", "bias_thermal_hysteresis"),
+    C: (*_SCALE, "scale_temperature", "bias", "bias_temperature", *_TIME, "rate_hysteresis"),
+    RUNS: ("bias_turn_on",),
     "static_ramp": ("bias_temperature", "bias_drift"),
     "tumble": (*_FORCE, "misalignment", "scale_factor", "bias_temperature"),
     "turntable": ("table_tilt", "bias_magnetic", "table_harmonic", "scale_factor", "scale_asymmetry",

@@ -45,7 +45,13 @@ def _signals(name: str, design: Design) -> Array:
         case "bias_temperature_curve" | "scale_temperature_curve":
             knots = np.percentile(design.true["temperature"], np.linspace(20, 80, 12))
             shapes = [{"kind": kind, "at": at} for kind in ("parabola", "bend") for at in knots]
-        case "bias_temperature_rate":
+        case "bias_thermal_hysteresis" | "rate_hysteresis":
+            driver = design.true["rate" if name == "rate_hysteresis" else "temperature"]
+            shapes = [{"half_width": part * np.ptp(driver)} for part in np.geomspace(0.03, 0.25, 10)]
+        case "bias_turn_on":
+            runs = np.eye(len(np.unique(design.true["run"])))[1:]
+            return np.stack([error(name, design, 1.0, {"offsets": row}) for row in runs], axis=-1)[:, None]
+        case "bias_temperature_rate" | "bias_temperature_product":
             shapes = [{"tau": 2.5 * design.step}]
         case "bias_warmup":
             shapes = [{"tau": tau * span} for tau in np.geomspace(0.04, 0.3, 12)]

@@ -12,6 +12,15 @@ from typing import Any
 import numpy as np
 
 from .designs import Design
+from .memory import (
+    bias_readout_code,
+    bias_thermal_hysteresis,
+    bias_turn_on,
+    draw_hysteresis,
+    draw_table,
+    rate_hysteresis,
+    scale_drift,
+)
 from .motion import MOTION_EFFECTS, MOTION_SHAPES
 
 Array = np.ndarray
@@ -108,6 +117,12 @@ def bias_temperature_rate(design: Design, amplitude: float, tau: float) -> Array
     return amplitude * np.interp(design.true["time"], time, coil_temperature_rate(time, surface, tau))
 
 
+def bias_temperature_product(design: Design, amplitude: float, tau: float) -> Array:
+    """Shupe whose coefficient changes with temperature and is zero in the middle."""
+    temperature = design.true["temperature"]
+    return bias_temperature_rate(design, amplitude, tau) * (temperature - temperature.mean())
+
+
 # Bias by time.
 def bias(design: Design, amplitude: float) -> Array:
     """Constant bias."""
@@ -194,7 +209,8 @@ EFFECTS: dict[str, Effect] = {
     for f in (
         scale_factor, scale_asymmetry, scale_nonlinearity, scale_temperature, scale_temperature_curve,
         scale_sagnac_sine, bias, bias_temperature, bias_temperature_curve, bias_temperature_rate,
-        bias_drift, bias_step, bias_warmup, bias_periodic,
+        bias_drift, bias_step, bias_warmup, bias_periodic, bias_temperature_product, bias_thermal_hysteresis,
+        rate_hysteresis, bias_turn_on, scale_drift, bias_readout_code,
     )
 } | {f"bias_{c}": _linear(c) for c in ("supply_voltage", "pressure", "laser_current")} | MOTION_EFFECTS  # fmt: skip
 
@@ -235,6 +251,11 @@ SHAPES: dict[str, Callable[[Design, np.random.Generator], dict[str, Any]]] = {
     "scale_temperature_curve": _draw_curve,
     "bias_temperature_curve": _draw_curve,
     "bias_temperature_rate": lambda design, rng: {"tau": rng.uniform(1.0, 4.0) * design.step},
+    "bias_temperature_product": lambda design, rng: {"tau": rng.uniform(1.0, 4.0) * design.step},
+    "bias_thermal_hysteresis": lambda design, rng: draw_hysteresis(design.true["temperature"], rng),
+    "rate_hysteresis": lambda design, rng: draw_hysteresis(design.true["rate"], rng),
+    "bias_turn_on": lambda design, rng: {"offsets": rng.standard_normal(len(np.unique(design.true["run"])))},
+    "bias_readout_code": lambda design, rng: draw_table(rng),
     "bias_step": lambda design, rng: {"at": rng.uniform(*np.quantile(design.true["time"], [0.1, 0.9]))},
     "bias_warmup": lambda design, rng: {"tau": rng.uniform(0.05, 0.25) * design.true["time"][-1]},
     "bias_periodic": _draw_line,
