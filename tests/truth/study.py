@@ -182,17 +182,17 @@ def _isolable(case: Case, truth: Truth, knower: Oracle, signals: contest.Library
     names = parts(case.effect)
     for i, name in enumerate(names):
         beside = knower
-        for other, wrong in zip(names, truth.errors, strict=True):
+        for other, signal in zip(names, truth.errors, strict=True):
             # Beside the other as it is, or at any coefficients where it has but one form.
             block = signals.get(other, np.zeros((0, 0, 0)))
-            taken = block[:, 0] if other != name and block.shape[1] == 1 else wrong[:, None]
+            taken = block[:, 0] if block.shape[1] == 1 else signal[:, None]
             if other != name:
                 basis = np.column_stack([knower.basis, knower.reduce(taken / np.abs(taken).max())])
                 beside = replace(knower, basis=np.linalg.qr(basis)[0])
         rivals = {k: v for k, v in signals.items() if k == name or k not in names}
         wrong = beside.reduce(truth.errors[i][:, None])[:, 0]
         needed = contest.separation_needed(contest.reduced(beside, rivals), name, wrong)
-        if np.linalg.norm(wrong) / case.times_mde * 3 < max(needed.values()):
+        if np.linalg.norm(wrong) / case.times_mde * 3 < max(needed.values(), default=0.0):
             return False
     return True
 
