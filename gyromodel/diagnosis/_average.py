@@ -15,12 +15,15 @@ def average(campaign: Campaign, maximum: int = MAXIMUM_ROWS) -> tuple[Campaign, 
     """Means of consecutive samples, never across a gap or a change of segment, run or position.
 
     Increments and angles become rates, so that a mean is one whatever its samples' spacing. Where a stretch ends, a
-    last group of less than half the samples is dropped, unless it is all of the stretch.
+    last group of less than half the samples is dropped, unless it is all of the stretch. Of a campaign with a feedback
+    ramp the first samples are kept as they are: a mean over its turns tells nothing of its codes.
 
     Returns:
         The shorter campaign and how many samples went into each mean (1: unchanged).
     """
     rows = len(campaign)
+    if rows > maximum and "feedback_ramp" in campaign.columns:
+        return campaign.select(np.arange(rows) < maximum), 1
     together = -(-rows // maximum)
     if together == 1:
         return campaign, 1

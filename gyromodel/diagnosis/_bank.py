@@ -19,8 +19,8 @@ SMOOTH_SCALES = (0.08, 0.2, 0.5)
 PAIR_SCALES = (0.25, 0.6)
 # Columns whose linear effect on the bias is in the catalogue, is the scale factor, or means nothing.
 OWN_EFFECTS = ("rate", "temperature", "campaign")
-# What `compensate` adds is the output itself.
-NOT_DRIVERS = ("time", "output", "segment", "run", "position", "rate_estimated", "rate_estimated_std")
+# What `compensate` adds is the output itself; every function of the ramp's code is bias_readout_code.
+NOT_DRIVERS = ("time", "output", "segment", "run", "position", "feedback_ramp", "rate_estimated", "rate_estimated_std")
 
 
 @dataclass(frozen=True)

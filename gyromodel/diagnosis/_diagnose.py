@@ -107,6 +107,11 @@ def diagnose(
             f"Means of {most} consecutive samples were searched: lines above their sample rate and quantisation are "
             "averaged away."
         )
+    findings += [
+        f"The first {len(c)} of {len(g)} rows were searched: means tell nothing of the feedback ramp's codes."
+        for g, (c, m) in zip(campaigns, shortened, strict=True)
+        if m == 1 and len(c) < len(g)
+    ]
     record = read_signals([c for c, _ in shortened])
     check_covariates(record, model)
     record, left_out = with_columns_known(record)
