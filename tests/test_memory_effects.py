@@ -9,6 +9,7 @@ import pytest
 
 import gyromodel as gm
 from gyromodel.compensation import compensate
+from gyromodel.diagnosis._variance import quantum as step_of_output
 from gyromodel.effects.memory import BiasThermalHysteresis
 from gyromodel.effects.thermal import TemperatureLag
 from gyromodel.estimate import Calibration
@@ -16,7 +17,7 @@ from gyromodel.model import GyroModel, ModelError, make_effect
 from gyromodel.numerics.play import play
 from tests.truth import study
 from tests.truth.designs import DESIGNS
-from tests.truth.memory import YIELDS, bias_thermal_hysteresis, clipped, dragged, late, with_late_thermometer
+from tests.truth.memory import YIELDS, bias_thermal_hysteresis, clipped, dragged, late, rounded, with_late_thermometer
 
 
 @pytest.fixture
@@ -183,3 +184,15 @@ def test_a_clipped_output_is_saturation(seed: int):
     assert found.causes[0].effect == "saturation"
     told = next(p for p in found.causes[0].parameters if p.name == "limit")
     assert told.value == pytest.approx(np.rad2deg(limit), abs=max(5 * told.std, 1e-3))
+
+
+@pytest.mark.parametrize(("quantum", "said"), [(0.05, True), (2.0**-4, True), (1e-3, False)])
+def test_steps_of_the_output_are_said_of(quantum: float, said: bool, rng: np.random.Generator):
+    """A converter of whole numbers under noise of 0.05 deg/s; one much finer than the noise is nobody's concern."""
+    output = rounded(0.3 + 0.05 * rng.standard_normal(400), quantum)
+    campaign = gm.Campaign(
+        {"time": np.arange(400.0), "output": output}, {"time": "s", "output": "deg/s"}, {"kind": "rate"}
+    )
+    sentence = step_of_output(campaign)
+    assert (sentence is not None) == said
+    assert sentence is None or f"steps of {quantum:.5g} deg/s" in sentence
