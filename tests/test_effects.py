@@ -40,6 +40,7 @@ def signals_of(rng: np.random.Generator) -> dict[str, jax.Array]:
         "temperature_rate": 0.05 * np.cos(time / 300),
         "temperature_coil": 20 + 14 * np.sin(time / 300 - 0.2),
         "temperature_coil_rate": 0.045 * np.cos(time / 300 - 0.2),
+        "feedback_ramp": np.floor(32768 * (0.021 * np.arange(ROWS) % 1.0)),
         "run": np.repeat([3.0, 1.0, 4.0], [20, 20, ROWS - 40]),
         "pressure": 1e5 + 100 * rng.standard_normal(ROWS),
         "acceleration_input": 9.8 * rng.uniform(-1, 1, ROWS),
@@ -236,6 +237,18 @@ BY_HAND = [
         {"offsets": ["2 deg/h", "-1 deg/h"], "runs": ["7", "4"]},
         {"run": [5.0, 4.0, 7.0, 7.0, 8.0]},
         [0.0, -1.0, 2.0, 2.0, 0.0],
+    ),
+    (
+        "saturation",
+        {"share": "1", "limit": "40 deg/h"},
+        {"rate": [x * DEG_H for x in (-60.0, -40.0, 0.0, 39.0, 45.0)]},
+        [20.0, 0.0, 0.0, 0.0, -5.0],
+    ),
+    (
+        "bias_readout_code",
+        {"cosine": ["3 deg/h", "1 deg/h"], "sine": ["4 deg/h", "2 deg/h"], "period": "80"},
+        {"feedback_ramp": [0.0, 10.0, 20.0, 40.0, 80.0]},
+        [4.0, 7 / np.sqrt(2) + 2.0, 4.0 - 1.0, -3.0 + 1.0, 4.0],
     ),
     ("scale_drift", {"slope": "20 ppm/h"}, {"time": [0.0, 1800.0, 7200.0]}, [0.0, 10.0, 40.0]),
     (

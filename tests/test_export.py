@@ -59,7 +59,10 @@ def filled(label: str, record_signals: Signals, rng: np.random.Generator) -> Eff
     values = {}
     for name, declared in effect.declared().items():
         # Bands of a dithered lock-in that overlap, as at random values, leave no rate to an output.
-        if name not in ("breakpoints", "time_constant", "share", "runs") and label != "lock_in_dithered":
+        if (
+            name not in ("breakpoints", "time_constant", "share", "runs", "limit", "period")
+            and label != "lock_in_dithered"
+        ):
             size = declared.typical * factor(declared.unit, internal_unit(declared.unit)) if declared.linear else 1.0
             values[name] = size * jnp.asarray(rng.uniform(0.3, 1.0, np.shape(getattr(effect, name))))
     return replace(effect, **values)

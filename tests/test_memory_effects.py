@@ -9,6 +9,7 @@ import pytest
 
 import gyromodel as gm
 from gyromodel.compensation import compensate
+from gyromodel.diagnosis._variance import quantum as step_of_output
 from gyromodel.effects.memory import BiasThermalHysteresis
 from gyromodel.effects.thermal import TemperatureLag
 from gyromodel.estimate import Calibration
@@ -16,7 +17,7 @@ from gyromodel.model import GyroModel, ModelError, make_effect
 from gyromodel.numerics.play import play
 from tests.truth import study
 from tests.truth.designs import DESIGNS
-from tests.truth.memory import YIELDS, bias_thermal_hysteresis, dragged, late, with_late_thermometer
+from tests.truth.memory import YIELDS, bias_thermal_hysteresis, clipped, dragged, late, rounded, with_late_thermometer
 
 
 @pytest.fixture
@@ -44,7 +45,7 @@ def test_play_operator_is_the_sum_of_relays(half_width: float, rng: np.random.Ge
 def test_play_forgets_at_a_restart_and_has_a_derivative_by_its_width(rng: np.random.Generator):
     driver = jnp.asarray(np.cumsum(rng.standard_normal(300)))
     restart = jnp.zeros(300, bool).at[120].set(True)
-    whole, second = play(driver, jnp.asarray(0.8), restart), play(driver[120:], jnp.asarray(0.8), restart[:180])
+    whole, second = play(driver, jnp.asarray(0.8), restart), play(driver[120:], jnp.asarray(0.8), jnp.zeros(180, bool))
     assert np.asarray(whole[120:]) == pytest.approx(np.asarray(second), rel=1e-12)
     slope = jax.jvp(lambda w: play(driver, w, restart), (jnp.asarray(0.8),), (jnp.ones(()),))[1]
     difference = (
@@ -89,6 +90,7 @@ def test_a_monotone_ramp_shows_no_loop(rng: np.random.Generator):
         ("rate_steps", "rate_hysteresis"),
         ("rate_temperature", "scale_drift"),
         ("repeated_runs", "bias_turn_on"),
+        ("closed_loop", "bias_readout_code"),
     ],
 )
 def test_strong_effects_come_first(design: str, effect: str, seed: int):
@@ -168,3 +170,29 @@ def test_compensate_refuses_a_memory_of_rates():
     )
     with pytest.raises(ModelError, match="rate_hysteresis looks at earlier rates"):
         compensate(campaign, Calibration(GyroModel((make_effect("bias"), make_effect("rate_hysteresis")))))
+
+
+def test_a_clipped_output_is_saturation(seed: int):
+    """Rates of a table beyond the range of the converter, which simply ends."""
+    rng = np.random.default_rng(seed)
+    design = DESIGNS["rate_steps"](rng)
+    limit = rng.uniform(0.6, 0.85) * design.true["rate"].max()
+    output = clipped(design.true["rate"], limit) + 1e-5 * rng.standard_normal(len(design.index))
+    units = design.units | {"output": "deg/s"}
+    campaign = gm.Campaign(design.columns | {"output": np.rad2deg(output)}, units, dict(design.metadata))
+    found = gm.diagnose(campaign, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
+    assert found.causes[0].effect == "saturation"
+    told = next(p for p in found.causes[0].parameters if p.name == "limit")
+    assert told.value == pytest.approx(np.rad2deg(limit), abs=max(5 * told.std, 1e-3))
+
+
+@pytest.mark.parametrize(("quantum", "said"), [(0.05, True), (2.0**-4, True), (1e-3, False)])
+def test_steps_of_the_output_are_said_of(quantum: float, said: bool, rng: np.random.Generator):
+    """A converter of whole numbers under noise of 0.05 deg/s; one much finer than the noise is nobody's concern."""
+    output = rounded(0.3 + 0.05 * rng.standard_normal(400), quantum)
+    campaign = gm.Campaign(
+        {"time": np.arange(400.0), "output": output}, {"time": "s", "output": "deg/s"}, {"kind": "rate"}
+    )
+    sentence = step_of_output(campaign)
+    assert (sentence is not None) == said
+    assert sentence is None or f"steps of {quantum:.5g} deg/s" in sentence

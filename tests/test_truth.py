@@ -10,7 +10,7 @@ from scipy.stats import binomtest, kstest, kurtosis, norm
 from scipy.stats import t as student_t
 
 from tests.truth import contest, levels, noise, study
-from tests.truth.campaigns import RUNS, TESTABLE, UNCATALOGUED, A, B, C, hide
+from tests.truth.campaigns import LOOP, RUNS, TESTABLE, UNCATALOGUED, A, B, C, hide
 from tests.truth.designs import DESIGNS, RAMP_CODES
 from tests.truth.effects import EFFECTS, UNKNOWN, coil_temperature_rate, draw_shape, error
 from tests.truth.mde import REGULAR, SCAN, amplitude, baseline, oracle, simpler, target
@@ -320,8 +320,8 @@ def test_oracle_names_a_strong_effect_and_least_squares_is_fooled_by_flicker(see
 
 def test_cases_reproduce_and_cover_every_design_and_noise(seed):
     cases = study.effect_cases(17 * 9, seed, 3.0)
-    assert {(c.design, c.noise) for c in cases} == {(d, n) for d in (A, B, C, RUNS) for n in noise.FAMILY[:3]}
-    assert {c.effect for c in cases} == {e for d in (A, B, C, RUNS) for e in TESTABLE[d]}
+    assert {(c.design, c.noise) for c in cases} == {(d, n) for d in (A, B, C, RUNS, LOOP) for n in noise.FAMILY[:3]}
+    assert {c.effect for c in cases} == {e for d in (A, B, C, RUNS, LOOP) for e in TESTABLE[d]}
     assert len({c.seed for c in cases}) == len(cases)
     one, two = study.build(cases[0]), study.build(cases[0])
     assert all(np.array_equal(one.columns[k], two.columns[k]) for k in one.columns)

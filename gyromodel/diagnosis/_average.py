@@ -15,7 +15,8 @@ def average(campaign: Campaign, maximum: int = MAXIMUM_ROWS, seconds: float = 0.
     """Means of consecutive samples, never across a gap or a change of segment, run or position.
 
     Increments and angles become rates, so that a mean is one whatever its samples' spacing. Where a stretch ends, a
-    last group of less than half the samples is dropped, unless it is all of the stretch.
+    last group of less than half the samples is dropped, unless it is all of the stretch. Of a campaign with a feedback
+    ramp the first samples are kept as they are: a mean over its turns tells nothing of its codes.
 
     Args:
         campaign: one axis.
@@ -27,6 +28,8 @@ def average(campaign: Campaign, maximum: int = MAXIMUM_ROWS, seconds: float = 0.
     """
     rows = len(campaign)
     time = campaign.columns["time"]
+    if rows > maximum and "feedback_ramp" in campaign.columns:
+        return campaign.select(np.arange(rows) < maximum), 1
     together = max(-(-rows // maximum), round(seconds / float(np.median(np.diff(campaign.si("time"))))))
     if together == 1:
         return campaign, 1

@@ -19,8 +19,8 @@ PAIR_SCALES = (0.25, 0.6)
 # A column has a past worth looking at if its steps from row to row are this small beside its own variation; how long
 # before, as parts of a run.
 SLOW, LAGS = 0.05, (0.01, 0.03, 0.08)
-# What `compensate` adds is the output itself.
-NOT_DRIVERS = ("time", "output", "segment", "run", "position", "rate_estimated", "rate_estimated_std")
+# What `compensate` adds is the output itself; every function of the ramp's code is bias_readout_code.
+NOT_DRIVERS = ("time", "output", "segment", "run", "position", "feedback_ramp", "rate_estimated", "rate_estimated_std")
 
 
 def is_no_driver(name: str) -> bool:

@@ -11,8 +11,8 @@ from jaxtyping import Array, Float
 from gyromodel.effects._base import Effect, Signals, parameter, stack
 from gyromodel.numerics.play import play
 
-# Half widths searched, as parts of the driver's range: a loop wider than the range is never closed.
-NARROWEST, WIDEST, WIDTHS = 0.01, 0.45, 14
+# Half widths searched, as parts of the driver's range: the widest loops are hardly more than a line over the driver.
+NARROWEST, WIDEST, WIDTHS = 0.01, 0.3, 13
 # Samples at least on either branch of a loop, and as a part of all.
 FEWEST, SHARE = 3, 0.02
 

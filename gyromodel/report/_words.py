@@ -28,6 +28,8 @@ PHRASES = {
     "bias_temperature_gradient": "a bias proportional to a temperature difference",
     "bias_temperature_gradient_rate": "a bias proportional to the rate of a temperature difference",
     "rate_hysteresis": "a hysteresis over rate",
+    "saturation": "saturation: the output ends at the limits of its range",
+    "bias_readout_code": "an error of the feedback ramp's codes",
     "bias_turn_on": "a bias that differs from turn-on to turn-on",
     "bias_warmup": "a warm-up bias",
     "bias_drift": "a bias drift in time",

@@ -15,7 +15,7 @@ from .noise import Noise
 
 Array = np.ndarray
 
-A, B, C, RUNS = "rate_temperature", "static_cycle", "rate_steps", "repeated_runs"
+A, B, C, RUNS, LOOP = "rate_temperature", "static_cycle", "rate_steps", "repeated_runs", "closed_loop"
 _TIME = ("bias_drift", "bias_step", "bias_warmup", "bias_periodic")
 _SCALE = ("scale_factor", "scale_asymmetry", "scale_nonlinearity", "scale_sagnac_sine")
 _THERMAL = ("bias_temperature", "bias_temperature_curve")
@@ -27,6 +27,7 @@ TESTABLE: dict[str, tuple[str, ...]] = {  # catalogue effects that each design c
         "bias_laser_current", "bias_temperature_product", "bias_thermal_hysteresis"),
     C: (*_SCALE, "scale_temperature", "bias", "bias_temperature", *_TIME, "rate_hysteresis"),
     RUNS: ("bias_turn_on",),
+    LOOP: ("bias_readout_code",),
     "static_ramp": ("bias_temperature", "bias_drift"),
     "tumble": (*_FORCE, "misalignment", "scale_factor", "bias_temperature"),
     "turntable": ("table_tilt", "bias_magnetic", "table_harmonic", "scale_factor", "scale_asymmetry",

@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
 from .campaigns import TESTABLE
-from .designs import Design
+from .designs import RAMP_CODES, Design
 from .effects import error
 from .mde import Oracle, baseline
 from .motion import BASIS, SMALL
@@ -48,6 +48,9 @@ def _signals(name: str, design: Design) -> Array:
         case "bias_thermal_hysteresis" | "rate_hysteresis":
             driver = design.true["rate" if name == "rate_hysteresis" else "temperature"]
             shapes = [{"half_width": part * np.ptp(driver)} for part in np.geomspace(0.03, 0.25, 10)]
+        case "bias_readout_code":
+            angle = np.pi * design.true["feedback_ramp"][:, None] / RAMP_CODES * np.arange(1, 9)
+            return np.concatenate([np.sin(angle), np.cos(angle)], axis=1)[:, None]
         case "bias_turn_on":
             runs = np.eye(len(np.unique(design.true["run"])))[1:]
             return np.stack([error(name, design, 1.0, {"offsets": row}) for row in runs], axis=-1)[:, None]

@@ -1,0 +1,99 @@
+"""What converters add: the end of their range, and the errors of their codes."""
+
+from __future__ import annotations
+
+from typing import Self
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from gyromodel.effects._base import Effect, Signals, parameter, stack
+
+# Limits searched, as parts of the largest rate, and different rates that must lie beyond one.
+LOWEST, HIGHEST, LIMITS, FEWEST_BEYOND = 0.2, 0.99, 24, 2
+# Series over the ramp: how many harmonics, and periods searched as parts of its span. A ramp's ends need not meet:
+# twice the span leaves them free.
+SERIES = (
+    (1, 1.0 / np.arange(0.5, 8.5, 0.5)),
+    (2, 1.0 / np.array([0.5, 0.75, 1.0, 2.0, 4.0])),
+    (4, 1.0 / np.array([0.5, 0.75, 1.0, 2.0])),
+    (8, 1.0 / np.array([0.5, 0.75, 1.0])),
+)
+
+
+class Saturation(Effect):
+    """E += max(−ω_max, min(ω, ω_max)) − ω: the output ends at the limits of its range.
+
+    The search lets a share of the effect vary to have a linear coefficient; the fit holds it at one.
+    """
+
+    id = "saturation"
+    site = "rate"
+    needs = ("rate",)
+    cause = "The converter, the torquer or the loop has no more range."
+    test = "Leave out the largest rates: a nonlinearity bends those below as well, saturation does not."
+    held = ("share",)
+    positive = True
+    untested = "has fewer than two different rates beyond any limit"
+
+    share: Float[Array, ""] = parameter("1", 1.0, "part of the output that saturates", default=1.0)
+    limit: Float[Array, ""] = parameter("deg/s", 100.0, "largest rate that is told", linear=False, default=1.75)
+
+    def __check_init__(self) -> None:
+        if self.limit <= 0:
+            raise ValueError("a range ends above zero")
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """The rate cut at its limits, less the rate."""
+        return stack(jnp.clip(signals["rate"], -self.limit, self.limit) - signals["rate"])
+
+    def settled(self) -> Self:
+        """All of the output saturates."""
+        return type(self)(share=jnp.ones(()), limit=self.limit)
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """Limits with several rates beyond them."""
+        levels = np.unique(np.round(np.abs(np.asarray(signals["rate"])), 9))
+        limits = levels[-1] * np.linspace(LOWEST, HIGHEST, LIMITS)
+        return [cls(limit=limit) for limit in limits if np.sum(levels > limit) >= FEWEST_BEYOND]
+
+
+class BiasReadoutCode(Effect):
+    """D += Σ A_k cos(2πkc/P) + B_k sin(2πkc/P), c the code of the closed loop's ramp: an error of the ramp's codes.
+
+    A period P of twice the ramp's span serves for errors that do not meet at its ends, such as those of its flyback.
+    """
+
+    id = "bias_readout_code"
+    site = "rate"
+    needs = ("feedback_ramp",)
+    cause = "The ramp converter is not linear, or the ramp's flyback is not 2π, and the loop takes that for a rate."
+    test = (
+        "Turn at a rate that makes the ramp slow: the error then follows the code sample by sample, vibration does not."
+    )
+
+    cosine: Float[Array, " harmonic"] = parameter("deg/h", 1.0, "in-phase amplitude of each harmonic", default=(0.0,))
+    sine: Float[Array, " harmonic"] = parameter("deg/h", 1.0, "quadrature amplitude of each harmonic", default=(0.0,))
+    period: Float[Array, ""] = parameter("1", 3e4, "in the ramp's counts, V or rad", linear=False, default=65536.0)
+
+    def __check_init__(self) -> None:
+        if self.cosine.shape != self.sine.shape or self.period <= 0:
+            raise ValueError("every harmonic needs a cosine and a sine, and the period is above zero")
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """The cosines, then the sines."""
+        harmonic = 1.0 + jnp.arange(self.cosine.shape[0])
+        phase = 2.0 * jnp.pi * signals["feedback_ramp"][:, None] * harmonic / self.period
+        return jnp.concatenate([jnp.cos(phase), jnp.sin(phase)], axis=1)
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """From one harmonic of many periods to eight of the whole ramp's."""
+        span = np.ptp(np.asarray(signals["feedback_ramp"]))
+        return [
+            cls(cosine=jnp.zeros(count), sine=jnp.zeros(count), period=jnp.asarray(span * part))
+            for count, parts in SERIES
+            for part in parts
+        ]
