@@ -223,6 +223,16 @@ def test_delay_and_lag_are_one_to_first_order_and_two_beyond(rng: np.random.Gene
     small, _ = told("dynamic_rates", "time_delay", seed)
     assert (small.verdict, set(small.credible_set)) == ("ambiguous", {"time_delay", "bandwidth"}), f"seed {seed}"
 
+    # Two samples late at up to 4 Hz, the phase bends.
+    design = lived("dynamic_rates", rng)
+    late = design.true["rate"] + error("time_delay", design, 0.02, {})
+    noisy = campaign_of(design, late + np.deg2rad(0.2) * rng.standard_normal(len(late)))
+    large = gyromodel.diagnose(noisy, model_from_effects(["scale_factor", "bias"]), hold_out=False)
+    assert (large.verdict, [c.effect for c in large.causes]) == ("named", ["time_delay"])
+    delay = next(p for p in large.causes[0].parameters if p.name == "delay")
+    assert delay.unit == "ms"
+    assert delay.value == pytest.approx(20.0, abs=6 * delay.std)
+
 
 PLAN = """
 gyro: rig
