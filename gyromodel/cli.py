@@ -190,6 +190,7 @@ def simulate(
     if pattern_file is None or (like and plan):
         raise typer.BadParameter("give either --like CAMPAIGN or --plan PLAN.yaml", param_hint="--like")
     _refuse_overwriting(output, [model, pattern_file])
+    from gyromodel.attitude import with_reference_rates
     from gyromodel.files import read_campaign, write_campaign
     from gyromodel.model import simulate as simulate_campaign
     from gyromodel.model_files import read_model
@@ -197,6 +198,7 @@ def simulate(
 
     simulated_by = read_model(model)
     pattern = read_plan(pattern_file) if plan else read_campaign(pattern_file)
+    pattern = with_reference_rates(pattern)
     simulated = simulate_campaign(simulated_by, pattern.axis(axis) if axis else pattern, seed)
     output.parent.mkdir(parents=True, exist_ok=True)
     write_campaign(simulated, output)
@@ -235,23 +237,37 @@ def compensate(
     campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Its output and what the model needs besides.")],
     output: CampaignFile,
     axis: Axis = None,
+    force: Annotated[bool, typer.Option("--force", help="Write also what errs more than the output as it is.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Apply a calibration: add the estimated rate and its standard uncertainty to a campaign."""
+    """Apply a calibration: add the estimated rate and its standard uncertainty to a campaign.
+
+    On a campaign with a reference rate, a calibration that makes its error larger is refused.
+    """
     _refuse_overwriting(output, [model, campaign])
+    from gyromodel._checks import CampaignError
     from gyromodel.compensation import compensate as compensate_campaign
+    from gyromodel.compensation import reference_error
     from gyromodel.files import write_campaign
     from gyromodel.model_files import read_calibration
 
     calibration = read_calibration(model)
     compensated = compensate_campaign(_read([campaign], axis)[0], calibration)
+    error, held = reference_error(compensated), ""
+    if error:
+        held = f"rms error against its reference rate is {error.compensated:.4g} deg/s, and {error.as_measured:.4g} as"
+        if error.worse and not force:
+            raise CampaignError(f"{campaign}: {model} makes it worse: the {held} measured; --force writes it anyway")
     output.parent.mkdir(parents=True, exist_ok=True)
     write_campaign(compensated, output)
     note = str(compensated.metadata.get("rate_estimated_note", ""))
     if note:
         print(f"gyromodel: {note}", file=sys.stderr)
     result = {"campaign": str(output), "rows": len(compensated), "note": note, "data_hash": compensated.digest()}
-    print(_json(result) if as_json else f"{len(compensated)} samples in {output}\n", end="")
+    if as_json:
+        print(_json(result | {"reference_error": error and error._asdict()}), end="")
+        return
+    print(f"{len(compensated)} samples in {output}" + (f"; the {held} measured" if held else ""))
 
 
 @app.command()
@@ -359,9 +375,10 @@ def _diagnose(
 
 
 def _read(paths: Sequence[Path], axis: str | None) -> list[Campaign]:
+    from gyromodel.attitude import with_reference_rates
     from gyromodel.files import read_campaign
 
-    measured = [read_campaign(path) for path in paths]
+    measured = [with_reference_rates(read_campaign(path)) for path in paths]
     return [campaign.axis(axis) for campaign in measured] if axis else measured
 
 

@@ -13,13 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy import stats
 
 from gyromodel._checks import thermometers
 from gyromodel.campaign import Campaign
 from gyromodel.effects import Signals
 from gyromodel.estimate import Calibration, check_covariates, validity_unit
 from gyromodel.model import GyroModel, ModelError, check_units
-from gyromodel.signals import Record, read_signals
+from gyromodel.signals import Record, rate_output, read_signals
 from gyromodel.units import from_internal
 
 # Newton's steps shrink quadratically: after one of this relative size the next would be lost in rounding.
@@ -34,6 +35,8 @@ WAYPOINTS = 8
 SURELY = 6.0
 # Ranges in files are rounded to ten digits.
 ROUNDING = 1e-9
+# A campaign with a reference rate is judged by so many parts of equal length.
+PARTS = 10
 
 
 def compensate(campaign: Campaign, calibration: Calibration) -> Campaign:
@@ -72,6 +75,37 @@ def compensate(campaign: Campaign, calibration: Calibration) -> Campaign:
         "rate_estimated_std_holds": ", ".join(_held(calibration)) or "nothing",
         "rate_estimated_note": " ".join(notes) or None,
     })  # fmt: skip
+
+
+class ReferenceError(NamedTuple):
+    """Rms error of the estimated rate and of the output as it is, against a reference rate (deg/s).
+
+    `worse` says that the estimate errs more, beyond what the parts of the campaign differ by.
+    """
+
+    compensated: float
+    as_measured: float
+    worse: bool
+
+
+def reference_error(compensated: Campaign) -> ReferenceError | None:
+    """What a calibration does on a campaign that knows its rate; None where that or the output as a rate is not known.
+
+    Args:
+        compensated: what `compensate` returned.
+    """
+    output, unit = rate_output(compensated)
+    if "rate" not in compensated.columns or unit != "rad/s":
+        return None
+    rate = compensated.in_unit("rate", "deg/s")
+    errors = np.array([compensated.in_unit("rate_estimated", "deg/s") - rate, from_internal(output, "deg/s") - rate])
+    errors = errors[:, np.isfinite(errors).all(axis=0)]
+    if errors.shape[1] < 2 * PARTS:
+        return None
+    after, before = np.sqrt(np.mean(errors**2, axis=1))
+    excess = [float(np.mean(part[0] ** 2 - part[1] ** 2)) for part in np.array_split(errors, PARTS, axis=1)]
+    worse = np.mean(excess) > float(stats.t.ppf(0.95, PARTS - 1)) * np.std(excess, ddof=1) / np.sqrt(PARTS)
+    return ReferenceError(float(after), float(before), bool(worse))
 
 
 def _held(calibration: Calibration) -> list[str]:

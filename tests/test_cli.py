@@ -15,10 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from gyromodel import cli
-from gyromodel.files import read_campaign
+from gyromodel.campaign import Campaign
+from gyromodel.files import read_campaign, write_campaign
 
 COMMANDS = ("demo", "fit", "diagnose", "simulate", "compensate", "export", "allan", "effects")
 HEAVY = {"jax", "equinox", "numpy", "pandas", "pint", "matplotlib", "xarray", "scipy", "rich"}
@@ -328,6 +330,37 @@ def test_compensate_refuses_what_it_cannot_apply(tmp_path: Path, run: Run, model
     outcome = run("compensate", tmp_path / "model.yaml", tmp_path / "campaign.csv", "-o", tmp_path / "out.csv")
     assert expected in refusal(outcome)
     assert not (tmp_path / "out.csv").exists()
+
+
+def test_compensate_refuses_what_makes_a_campaign_with_a_reference_worse(tmp_path: Path, run: Run):
+    """A scale factor and a lean of its own unit, and the same of a unit that errs the other way round."""
+    rng, time = np.random.default_rng(5), np.arange(500) * 0.1
+    rate, cross = 30.0 * np.sin(time), 30.0 * np.cos(0.7 * time)
+    noise = 0.02 * rng.standard_normal(500)
+    for name, sign in (("own", 1.0), ("other", -1.0)):
+        columns = {"time": time, "rate_x": rate, "rate_y": cross}
+        columns["output_x"] = rate * (1.0 + 0.004 * sign) + 0.003 * sign * cross + noise
+        units = {"time": "s"} | dict.fromkeys(("rate_x", "rate_y", "output_x"), "deg/s")
+        write_campaign(Campaign(columns, units, {"kind": "rate"}), tmp_path / f"{name}.csv")
+    (tmp_path / "model.yaml").write_text(
+        "effects:\n  - {effect: scale_factor, value: 1.004}\n"
+        "  - {effect: misalignment, angles: [0.003 rad], about: [rate_y]}\n",
+        encoding="utf-8",
+    )
+    given = (tmp_path / "model.yaml", "--axis", "x", "-o", tmp_path / "out.csv")
+    done = run("compensate", *given, tmp_path / "own.csv", "--json")
+    assert done.status == 0, done.err
+    found = json.loads(done.out)["reference_error"]
+    assert found["compensated"] == pytest.approx(noise.std(), rel=0.05)
+    wrong = np.std(0.004 * rate + 0.003 * cross)
+    assert found["as_measured"] == pytest.approx(np.hypot(wrong, noise.std()), rel=0.05)
+    (tmp_path / "out.csv").unlink()
+    said = refusal(run("compensate", *given, tmp_path / "other.csv"))
+    assert f"makes it worse: the rms error against its reference rate is {2 * wrong:.1f}" in said
+    assert not (tmp_path / "out.csv").exists()
+    forced = run("compensate", *given, tmp_path / "other.csv", "--force")
+    assert forced.status == 0
+    assert "rms error" in forced.out
 
 
 @pytest.mark.parametrize(("to", "part"), [("c", "gyromodel_rate"), ("json", '"covariance"'), ("csv", "scale_factor,")])

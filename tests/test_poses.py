@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import gyromodel
 from gyromodel._checks import CampaignError
 from gyromodel.campaign import Campaign
 from gyromodel.files import read_campaign
@@ -13,8 +14,11 @@ from gyromodel.poses import at_rest, static_poses
 STEP = 0.01
 
 
-def turned(rng: np.random.Generator, poses: int) -> tuple[Campaign, np.ndarray]:
-    """Rests of 3 to 8 s, turns of 1 to 2 s between them; and the number of each row's pose, 0 in motion."""
+def turned(rng: np.random.Generator, poses: int, by_gravity: float = 0.0) -> tuple[Campaign, np.ndarray]:
+    """Rests of 3 to 8 s, turns of 1 to 2 s between them; and the number of each row's pose, 0 in motion.
+
+    A hand's tremor of 10 Hz stays at rest; `by_gravity` is the gyro's error (rad/s) at 1 g along y.
+    """
     truth, rate, level = [], [], []
     start = rng.uniform(-1, 1, 3)
     for k in range(poses):
@@ -26,7 +30,9 @@ def turned(rng: np.random.Generator, poses: int) -> tuple[Campaign, np.ndarray]:
         start = end
     truth, rate, level = (np.concatenate(v) for v in (truth, rate, level))
     acceleration = 9.8 * level + 0.02 * rng.standard_normal(level.shape)
-    columns = {"time": np.arange(len(rate)) * STEP, "output": rate + 0.01 * rng.standard_normal(len(rate))}
+    time = np.arange(len(rate)) * STEP
+    wrong = by_gravity * level[:, 1] + 0.005 * np.sin(62.8 * time) + 0.01 * rng.standard_normal(len(rate))
+    columns = {"time": time, "output": rate + wrong}
     columns |= {f"acceleration_{axis}": acceleration[:, i] for i, axis in enumerate("xyz")}
     units = {"time": "s", "output": "rad/s"} | {f"acceleration_{axis}": "m/s^2" for axis in "xyz"}
     return Campaign(columns, units, {"kind": "rate", "test": "multi_position"}), truth
@@ -62,3 +68,16 @@ def test_without_poses_or_accelerations_there_is_a_sentence(rng: np.random.Gener
         static_poses(bare)
     with pytest.raises(CampaignError, match="shows 1 static poses"):
         static_poses(campaign.select(slice(0, 250)))
+
+
+def test_what_gravity_adds_is_named_and_judged_by_means_of_poses():
+    """The truth is 0.002 rad/s per g; noise of 0.01 rad/s a row leaves 0.01/√300 = 6e-4 in the mean of a pose."""
+    rng = np.random.default_rng(6)
+    wrong, right = (turned(rng, 12, by_gravity)[0] for by_gravity in (2e-3, 0.0))
+    found = gyromodel.diagnose(wrong, gyromodel.model_from_effects(["bias"]))
+    assert [cause.effect for cause in found.causes] == ["bias_acceleration_y"]
+    assert found.gain.folds == 10
+    assert "groups of positions" in found.gain.scheme
+    assert found.gain.after < 1e-3
+    assert found.gain.ci95[0] > 1.0
+    assert gyromodel.diagnose(right, gyromodel.model_from_effects(["bias"]), hold_out=False).verdict == "adequate"

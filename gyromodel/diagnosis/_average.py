@@ -1,4 +1,4 @@
-"""Averages of long campaigns: the search needs no more rows than resolve the slow effects."""
+"""Averages of long campaigns and of poses: the search needs no more rows than resolve the slow effects."""
 
 from __future__ import annotations
 
@@ -11,22 +11,27 @@ from gyromodel.units import from_internal
 MAXIMUM_ROWS = 20_000
 
 
-def average(campaign: Campaign, maximum: int = MAXIMUM_ROWS) -> tuple[Campaign, int]:
+def average(campaign: Campaign, maximum: int = MAXIMUM_ROWS, seconds: float = 0.0) -> tuple[Campaign, int]:
     """Means of consecutive samples, never across a gap or a change of segment, run or position.
 
     Increments and angles become rates, so that a mean is one whatever its samples' spacing. Where a stretch ends, a
     last group of less than half the samples is dropped, unless it is all of the stretch.
 
+    Args:
+        campaign: one axis.
+        maximum: about the most rows to leave.
+        seconds: the least length of a mean.
+
     Returns:
         The shorter campaign and how many samples went into each mean (1: unchanged).
     """
     rows = len(campaign)
-    together = -(-rows // maximum)
+    time = campaign.columns["time"]
+    together = max(-(-rows // maximum), round(seconds / float(np.median(np.diff(campaign.si("time"))))))
     if together == 1:
         return campaign, 1
     if campaign.metadata["kind"] != "rate":
         campaign = _as_rate(campaign)
-    time = campaign.columns["time"]
     step = np.diff(time)
     breaks = np.concatenate([[False], step > GAP * np.median(step)])
     for name in ("segment", "run", "position"):

@@ -14,23 +14,43 @@ from gyromodel.signals import Record
 
 # Ordinary weights replace the noise model's where they lower the held-out rms to less than this part.
 ORDINARY_MARGIN = 0.9
+# Blocks that are positions.
+POSITIONS = "positions"
+# The whole search is repeated for each fold: more would tell little more.
+MOST_FOLDS = 10
 
 
-def blocks_of(record: Record) -> list[np.ndarray]:
-    """Rows of each block that has outputs."""
-    present = record.present
-    found = [np.flatnonzero((record.blocks == b) & present) for b in np.unique(record.blocks)]
-    return [rows for rows in found if len(rows)]
+def folds_of(record: Record) -> tuple[list[np.ndarray], str]:
+    """Rows of each fold that has outputs, and what a fold is: a block, or several where there are more than ten.
+
+    Blocks are dealt out at random, always alike, so that folds follow no order of the test.
+    """
+    present, scheme = record.present, record.block_scheme
+    number = np.unique(record.blocks, return_inverse=True)[1]
+    blocks = number.max() + 1
+    if blocks > MOST_FOLDS:
+        number = (np.random.default_rng(0).permutation(blocks) % MOST_FOLDS)[number]
+        scheme = f"groups of {scheme}"
+    scheme += " left out" + (", errors of their means" if record.block_scheme == POSITIONS else "")
+    found = [np.flatnonzero((number == k) & present) for k in range(number.max() + 1)]
+    return [rows for rows in found if len(rows)], scheme
 
 
 def held_out(record: Record, train: Estimate, rows: np.ndarray) -> tuple[np.ndarray, float]:
-    """Errors of a block (as a rate) by a model fitted without it, and its log score given the other blocks' noise."""
+    """Errors of a fold (as a rate) by a model fitted without it, and its log score given the other folds' noise.
+
+    What a position tells is in its mean, so that of positions the error of each mean counts.
+    """
     predicted = np.asarray(train.model.predict(record.signals))
     slope = np.asarray(train.model.slope(record.signals))
     residual = np.asarray(record.signals["output"]) - predicted
-    with_block = _log_density(record, residual, train)
+    with_fold = _log_density(record, residual, train)
     without = _log_density(record.without(rows), residual, train)
-    return residual[rows] / slope[rows], with_block - without
+    errors = residual[rows] / slope[rows]
+    if record.block_scheme == POSITIONS:
+        number = np.unique(record.blocks[rows], return_inverse=True)[1]
+        errors = np.bincount(number, errors) / np.bincount(number)
+    return errors, with_fold - without
 
 
 def _log_density(record: Record, residual: np.ndarray, estimate: Estimate) -> float:
@@ -55,7 +75,7 @@ def ladder_error(record: Record, estimate: Estimate) -> tuple[float, float, bool
     errors: dict[bool, list[np.ndarray]] = {False: [], True: []}
     score = 0.0
     model = estimate.model_as_given()
-    for rows in blocks_of(record):
+    for rows in folds_of(record)[0]:
         try:
             train = fit_record(record.without(rows), model, ratios=estimate.ratios)
             # From the other solution it is a step or two.
@@ -92,8 +112,8 @@ def nested_gain(
         progress: called with folds done and in all.
     """
     before, after, scores = [], [], []
-    blocks, scheme = blocks_of(record), record.block_scheme
-    for k, rows in enumerate(blocks):
+    folds, scheme = folds_of(record)
+    for k, rows in enumerate(folds):
         try:
             base = fit_record(record.without(rows), baseline.model_as_given(), ratios=baseline.ratios)
             extended = select(rows, base)
@@ -105,8 +125,8 @@ def nested_gain(
         after.append(np.mean(e1**2))
         scores.append(s1 - s0)
         if progress:
-            progress(k + 1, len(blocks))
-    if lost := len(blocks) - len(scores):
+            progress(k + 1, len(folds))
+    if lost := len(folds) - len(scores):
         scheme += f" ({lost} more could not be predicted)"
     return _summary(np.array(before), np.array(after), np.array(scores), scheme, unit, scale)
 
@@ -128,7 +148,7 @@ def _summary(before, after, scores, scheme: str, unit: str, scale: float) -> Gai
             unit,
             1.0,
             (0.0, np.inf),
-            f"{scheme}: too few to hold one out",
+            "too few blocks to hold one out",
             folds,
             0.0,
             (-np.inf, np.inf),
@@ -147,7 +167,7 @@ def _summary(before, after, scores, scheme: str, unit: str, scale: float) -> Gai
         unit,
         ratio,
         interval,
-        f"nested, one of {folds} {scheme} left out",
+        f"nested, one of {folds} {scheme}",
         folds,
         total,
         (total - t * error, total + t * error),
@@ -157,15 +177,15 @@ def _summary(before, after, scores, scheme: str, unit: str, scale: float) -> Gai
 def no_gain(record: Record, baseline: Estimate, unit: str, scale: float) -> Gain:
     """The gain of an unchanged model: its held-out error, twice."""
     rms, _, _ = ladder_error(record, baseline)
-    folds = len(blocks_of(record))
+    folds, scheme = folds_of(record)
     return Gain(
         rms * scale,
         rms * scale,
         unit,
         1.0,
         (1.0, 1.0),
-        f"one of {folds} {record.block_scheme} left out",
-        folds,
+        f"one of {len(folds)} {scheme}",
+        len(folds),
         0.0,
         (0.0, 0.0),
     )

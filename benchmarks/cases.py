@@ -1,0 +1,145 @@
+"""The cases of docs/cases: the commands of the tool on measured campaigns, as an engineer would run them.
+
+    python -m benchmarks.cases [NAME …]
+
+writes benchmarks/results/cases.md, or with names only those parts of it to the screen. The data are read from the
+folder that GYROMODEL_DATA names, or ../shared/data; they are not part of the project.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import gyromodel
+from benchmarks._measure import ROOT, table, timed, write_result
+from gyromodel.estimate import fit_record
+from gyromodel.model_files import read_model
+from gyromodel.poses import static_poses
+from gyromodel.signals import read_signals
+
+DATA = Path(os.environ.get("GYROMODEL_DATA", ROOT.parent / "shared" / "data"))
+# Nominal, from the publication of the data: gyro 4770 count per rad/s, accelerometer 416 count per m/s².
+COUNTS = "4770 count*s/rad"
+GRAVITY = 416.0 * 9.81  # count
+AXES = "xyz"
+BIAS = "gyro: mems\neffects:\n  - effect: bias\n"
+KNOWN_SCALE = f"{BIAS}  - {{effect: scale_factor, value: {COUNTS}, fixed: true}}\n"
+
+
+def command(*arguments: str | Path) -> tuple[dict[str, Any], float, str]:
+    """What a command prints with --json, how long it took (s), and its sentence where it refuses."""
+    call = [sys.executable, "-m", "gyromodel", *map(str, arguments), "--json"]
+    done, spent = timed(lambda: subprocess.run(call, cwd=ROOT, capture_output=True, text=True, check=False))
+    if done.returncode not in (0, 1):
+        raise SystemExit(done.stderr)
+    return json.loads(done.stdout or "{}"), spent["wall"], done.stderr.strip()
+
+
+def diagnosed(campaign: Path, model: str, axis: str, folder: Path) -> tuple[dict[str, Any], float]:
+    """A diagnosis of one axis, its results in `folder`."""
+    folder.mkdir(parents=True)
+    (folder / "simulation.yaml").write_text(model)
+    arguments = ("--model", folder / "simulation.yaml", "--axis", axis, "-o", folder)
+    result, seconds, refusal = command("diagnose", campaign, *arguments)
+    if not result:
+        raise SystemExit(refusal)
+    return result, seconds
+
+
+def causes(result: dict[str, Any]) -> str:
+    """The verdict and its causes with ln B."""
+    named = ", ".join(f"{c['effect']} ({c['statistic']:.0f})" for c in result["causes"])
+    return f"{result['verdict']}{': ' if named else ''}{named}"
+
+
+def mems_multiposition_a(folder: Path) -> list[str]:
+    """Raw counts of 38 poses: what gravity adds."""
+    path = DATA / "mems_multiposition_a/campaign.csv.gz"
+    rows = []
+    for axis in AXES:
+        result, seconds = diagnosed(path, KNOWN_SCALE, axis, folder / axis)
+        gain = result["gain"]
+        sizes = [
+            f"{c['effect'][-1]}: {c['parameters'][0]['value'] * GRAVITY / 3600:+.3f} ± "
+            f"{c['parameters'][0]['std'] * GRAVITY / 3600:.3f}"
+            for c in result["causes"]
+        ]
+        one = [_pose_left_out(path, axis, folder / axis / name) for name in ("simulation.yaml", "model.yaml")]
+        rows.append([
+            axis, causes(result), "; ".join(sizes), f"{gain['before']:.4f} → {gain['after']:.4f}",
+            f"{one[0]:.4f} → {one[1]:.4f}", f"{seconds:.0f}",
+        ])  # fmt: skip
+    head = ["axis", "verdict (ln B)", "deg/s at 1 g along", "held out, search repeated, deg/s",
+            "one pose left out, deg/s", "s"]  # fmt: skip
+    return table(head, rows)
+
+
+def _pose_left_out(path: Path, axis: str, model: Path) -> float:
+    """Rms error (deg/s) of the mean of each pose, by a model fitted to the means of the others, all poses alike."""
+    posed = static_poses(gyromodel.read_campaign(path).axis(axis))
+    number = posed.columns["position"]
+    means = {n: np.array([v[number == k].mean() for k in np.unique(number)]) for n, v in posed.columns.items()}
+    record = read_signals(gyromodel.Campaign(means, posed.units, posed.metadata))
+    start, errors = read_model(model), []
+    for k in range(record.rows):
+        fitted = fit_record(record.without(np.array([k])), start, ordinary=True).model
+        predicted = np.asarray(fitted.predict(record.signals))[k]
+        errors.append((means["output"][k] - predicted) / float(fitted.gain()))
+    return float(np.rad2deg(np.sqrt(np.mean(np.square(errors)))))
+
+
+def mems_multiposition_b(folder: Path) -> list[str]:
+    """Three units compensated at the factory: nothing of that kind."""
+    rows = []
+    for unit in ("unit1", "unit2", "unit3"):
+        for axis in AXES:
+            path = DATA / f"mems_multiposition_b/{unit}.csv.gz"
+            result, seconds = diagnosed(path, BIAS, axis, folder / unit / axis)
+            shown = [result["minimum_detectable"][f"bias_acceleration_{other}"] for other in AXES]
+            least = [s["size"] / 3600 * 9.81 for s in shown]
+            poses = next(f for f in result["findings"] if "static poses" in f).split()[0]
+            rows.append([
+                unit, axis, poses, causes(result), f"{np.rad2deg(result['gain']['after']):.4f}",
+                " / ".join(f"{x:.3f}" for x in least), f"{seconds:.0f}",
+            ])  # fmt: skip
+    head = ["unit", "axis", "poses", "verdict", "one of ten groups left out, deg/s",
+            "least that would have been seen along x / y / z, deg/s/g", "s"]  # fmt: skip
+    return table(head, rows)
+
+
+CASES: dict[str, Callable[[Path], list[str]]] = {
+    "mems_multiposition_a": mems_multiposition_a,
+    "mems_multiposition_b": mems_multiposition_b,
+}
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run all cases, or those named."""
+    parser = argparse.ArgumentParser(description="The cases of docs/cases on measured campaigns.")
+    parser.add_argument("names", nargs="*", choices=[*CASES, []], metavar="NAME")
+    names = parser.parse_args(argv).names
+    if absent := [name for name in names or CASES if not (DATA / name).exists()]:
+        print(f"{', '.join(absent)}: not found in {DATA}; GYROMODEL_DATA names the folder of the measured data")
+        return
+    lines = []
+    with tempfile.TemporaryDirectory() as folder:
+        for name in names or CASES:
+            lines += [f"## [{name}](../../docs/cases/{name}.md)", "", *CASES[name](Path(folder, name)), ""]
+    if names:
+        print("\n".join(lines))
+    else:
+        write_result("cases", "Measured campaigns", "cases", [], lines)
+
+
+if __name__ == "__main__":
+    main()
