@@ -319,14 +319,14 @@ BY_HAND = [
         "time_delay",
         {"share": "1", "delay": "0.5 s"},
         {"time": np.arange(6.0), "rate": DEG_H * np.arange(6.0) ** 3},
-        [0.0, *((t - 0.5) ** 3 - t**3 for t in range(1, 6))],
+        [(t - 0.5) ** 3 - t**3 for t in range(6)],
     ),
-    # The lag of t²: d = −2τt + 2τ²(1 − exp(−t/τ)).
+    # The lag of t²: d = −2τt + 2τ², and what is left of the start, where the second term has a weight of exp(−1).
     (
         "bandwidth",
         {"share": "1", "time_constant": "2 s"},
         {"time": np.arange(6.0), "rate": DEG_H * np.arange(6.0) ** 2},
-        [-4.0 * t + 8.0 * (1.0 - np.exp(-t / 2.0)) for t in range(6)],
+        [-4.0 * t + 8.0 * (1.0 - (1.0 - np.exp(-1.0)) * np.exp(-t / 2.0)) for t in range(6)],
     ),
     (
         "output_axis_acceleration",

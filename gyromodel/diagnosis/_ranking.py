@@ -19,8 +19,8 @@ from gyromodel.model import GyroModel, effect_class
 # Cells within this many nats of the best, for any candidate that matters, get their neighbours searched too: those
 # better than nothing added and not hopelessly behind the best.
 NEARBY, HOPELESS = 7.0, 30.0
-# What explains all but this part of what another explains is the same signal.
-ALIKE = 1e-3
+# Candidates whose sums of squares differ by less than this part of the noise variance have the same signal.
+ALIKE = 0.2
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,7 @@ class Ranking:
     slow: dict[int, bool] = field(repr=False)
     walks: dict[int, bool] = field(repr=False)
     baseline_columns: np.ndarray = field(repr=False)
+    samples: int
     tangents: dict[str, Tangent] = field(default_factory=dict, repr=False)
 
     def best(self, *, drivers: bool, but: tuple[str, ...] = ()) -> tuple[str | None, float]:
@@ -72,13 +73,14 @@ class Ranking:
         Their signals hold the candidate's: no size of it would tell them apart on this campaign. Of those that contain
         one another only the simplest counts.
         """
-        best = self.results[self.best_cell(name)].best
-        _, explained, q = best[name]
+        result = self.results[self.best_cell(name)]
+        _, explained, q = result.best[name]
+        least = explained - ALIKE * (result.rss - explained) / self.samples
         alike = {
             k
-            for k, (_, t, width) in best.items()
-            if k != "outliers" and k in self.statistic and not is_driver(k) and not is_noise(k)
-            and width <= q + 1 and t >= (1.0 - ALIKE) * explained
+            for k, (_, t, width) in result.best.items()
+            if k != "outliers" and k in self.statistic and not is_driver(k)
+            and width <= q + 1 and t >= least
         }  # fmt: skip
         return {k for k in alike - {name} if not alike & set(effect_class(k).supersedes) - {k}}
 
@@ -151,7 +153,7 @@ def rank(
     walk, flicker = scanner.grid.ratios.walk, scanner.grid.ratios.flicker
     slow = {g: float(walk[g]) > 0 or float(flicker[g]) > 0 for g in cells}
     walks = {g: float(walk[g]) > 0 for g in cells}
-    return Ranking(statistic, posterior, results, prior, slow, walks, columns, continued)
+    return Ranking(statistic, posterior, results, prior, slow, walks, columns, scanner.degrees_of_freedom, continued)
 
 
 def tangents(scanner: Scanner, model: GyroModel, skip: set[str]) -> dict[str, Tangent]:

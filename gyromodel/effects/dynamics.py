@@ -18,8 +18,10 @@ from gyromodel.effects._base import Effect, Signals, parameter, stack
 GAP = 10.0
 # Least correlation of one change of the rate with the next: below it the rate is not followed between samples.
 RESOLVED = 0.5
+# Steps by which a rate is continued before the first sample.
+CONTINUED = 2.0
 # Delays and lags searched, in sample intervals: where only their product with the slope shows, to many.
-SHORTEST, LONGEST, STEPS = 0.01, 32.0, 24
+SHORTEST, LONGEST, STEPS = 0.05, 16.0, 40
 
 
 class TimeDelay(Effect):
@@ -133,13 +135,18 @@ def resolved(signals: Signals, name: str = "rate") -> bool:
     return bool(np.corrcoef(change[1:], change[:-1])[0, 1] > RESOLVED)
 
 
+def _usual(time: Float[Array, " sample"]) -> Float[Array, ""]:
+    """The usual step; padding repeats the last time, and a new run begins again at zero."""
+    step = jnp.diff(time)
+    return jnp.nanmedian(jnp.where(step > 0, step, jnp.nan))
+
+
 def _clock(
     time: Float[Array, " sample"],
 ) -> tuple[Float[Array, " sample"], Int[Array, " sample"], Int[Array, " sample"]]:
     """Time that always rises, and the first and last row of the stretch that each row lies in."""
     step = jnp.diff(time)
-    # Padding repeats the last time and would hide the usual step; a new run begins again at zero.
-    usual = jnp.nanmedian(jnp.where(step > 0, step, jnp.nan))
+    usual = _usual(time)
     starts = jnp.concatenate([jnp.ones(1, bool), (step <= 0) | (step > GAP * usual)])
     rows = jnp.arange(len(time))
     first = jax.lax.cummax(jnp.where(starts, rows, 0))
@@ -174,35 +181,47 @@ def _cubic(
     return jnp.sum(stack(*weights) * values[rows], axis=1)
 
 
+# Compiled whole: an effect has many forms, and operation by operation each length would be compiled by itself.
+@jax.jit
 def earlier(
     time: Float[Array, " sample"], values: Float[Array, " sample"], delay: Float[Array, ""]
 ) -> Float[Array, " sample"]:
-    """Values a delay before each sample, by the cubic through the four samples around; held at a stretch's ends."""
+    """Values a delay before each sample, by the cubic through the four samples around.
+
+    Beyond a stretch's ends it is continued by some steps and then held, for what came before is not known.
+    """
     clock, first, last = _clock(time)
-    return _cubic(clock, first, last, values, jnp.clip(clock - delay, clock[first], clock[last]))
+    beyond = CONTINUED * _usual(time)
+    return _cubic(clock, first, last, values, jnp.clip(clock - delay, clock[first] - beyond, clock[last] + beyond))
 
 
+@jax.jit
 def slope(time: Float[Array, " sample"], values: Float[Array, " sample"]) -> Float[Array, " sample"]:
     """Derivative by time, of the cubic through the four samples around."""
     clock, first, last = _clock(time)
     return jax.jvp(lambda t: _cubic(clock, first, last, values, t), (clock,), (jnp.ones_like(clock),))[1]
 
 
+@jax.jit
 def lag(
     time: Float[Array, " sample"], values: Float[Array, " sample"], time_constant: Float[Array, ""]
 ) -> Float[Array, " sample"]:
-    """Output less input of a first-order lag, which begins each stretch steadily behind.
+    """Output less input of a first-order lag, which begins each stretch behind as it would under constant acceleration.
 
     d = y − ω follows τ dd/dt + d = −τ dω/dt; between samples dω/dt is a straight line.
     """
     clock, first, _ = _clock(time)
     begins = first == jnp.arange(len(time))
     step = jnp.diff(clock, prepend=clock[0] - 1.0)
-    steady = -time_constant * slope(time, values)
+    rising = slope(time, values)
+    steady = -time_constant * rising
+    # d = −τ dω/dt + τ² d²ω/dt² − …, which only small time constants can take from so few samples.
+    known = jnp.exp(-((time_constant / (CONTINUED * _usual(time))) ** 2))
+    start = steady + known * time_constant**2 * slope(time, rising)
     decay, ratio = jnp.exp(-step / time_constant), time_constant / step
     mean = ratio * (1.0 - decay)
     drive = (1.0 - mean) * steady + (mean - decay) * jnp.concatenate([steady[:1], steady[:-1]])
-    decay, drive = jnp.where(begins, 0.0, decay), jnp.where(begins, steady, drive)
+    decay, drive = jnp.where(begins, 0.0, decay), jnp.where(begins, start, drive)
 
     def both(a, b):
         return a[0] * b[0], b[0] * a[1] + b[1]
