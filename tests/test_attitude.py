@@ -18,7 +18,9 @@ def moved(rows: int = 1500) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     fine = np.arange(rows * FINER) * STEP / FINER
     tones = np.random.default_rng(3).uniform([0.1, 0.0], [2.0, 6.28], (3, 4, 2))
     middle = fine + STEP / FINER / 2  # each small turn is by the rate in its middle
-    rate, between = (sum(np.sin(6.28 * f * t[:, None] + p) for f, p in tones.transpose(1, 2, 0)) for t in (fine, middle))
+    rate, between = (
+        sum(np.sin(6.28 * f * t[:, None] + p) for f, p in tones.transpose(1, 2, 0)) for t in (fine, middle)
+    )
     attitude, turns = [Rotation.identity()], Rotation.from_rotvec(between * STEP / FINER)
     for k in range(0, (rows - 1) * FINER, FINER):
         turned = attitude[-1]
