@@ -40,6 +40,7 @@ def signals_of(rng: np.random.Generator) -> dict[str, jax.Array]:
         "temperature_rate": 0.05 * np.cos(time / 300),
         "temperature_coil": 20 + 14 * np.sin(time / 300 - 0.2),
         "temperature_coil_rate": 0.045 * np.cos(time / 300 - 0.2),
+        "run": np.repeat([3.0, 1.0, 4.0], [20, 20, ROWS - 40]),
         "pressure": 1e5 + 100 * rng.standard_normal(ROWS),
         "acceleration_input": 9.8 * rng.uniform(-1, 1, ROWS),
         "acceleration_spin": 9.8 * rng.uniform(-1, 1, ROWS),
@@ -58,11 +59,13 @@ def signals_of(rng: np.random.Generator) -> dict[str, jax.Array]:
 
 def randomised(effect: Effect, signals: dict[str, jax.Array], rng: np.random.Generator) -> Effect:
     """Typical sizes with random factors; breakpoints inside and outside the range of temperatures met."""
-    if isinstance(effect, BiasTemperatureCurve) or effect.id == "scale_temperature_curve":
+    if isinstance(effect, BiasTemperatureCurve) or effect.id in ("scale_temperature_curve", "temperature_lag"):
         effect = type(effect)(coefficients=np.zeros(2), hinges=np.zeros(3), breakpoints=np.array([-60.0, 21.3, 90.0]))  # type: ignore[arg-type]
     effect = effect.prepared(signals)
     for name, declared in effect.declared().items():
         if name == "breakpoints":
+            continue
+        if name == "runs":
             continue
         size = (
             declared.typical * factor(declared.unit, internal_unit(declared.unit)) if declared.unit != "degC" else 1.0
@@ -197,6 +200,45 @@ BY_HAND = [
         [10.0, -10.0],
     ),
     (
+        "bias_temperature_product",
+        {"coefficient": "100 deg/h/(degC^2/s)", "reference": "20 degC"},
+        {"temperature": [30.0, 15.0], "temperature_rate": [0.01, -0.02]},
+        [10.0, 10.0],
+    ),
+    (
+        "temperature_lag",
+        {
+            "coefficients": ["1 deg/h", "2 deg/h"],
+            "hinges": ["3 deg/h/degC"],
+            "breakpoints": ["30 degC"],
+            "time_constant": "5 min",
+            "reference": "20 degC",
+        },
+        # three degrees ahead: 30, 33 and 17 degC
+        {"temperature": [27.0, 30.0, 20.0], "temperature_rate": [0.01, 0.01, -0.01]},
+        [3.0, 1.3 + 2 * 1.69 + 9.0, -0.3 + 2 * 0.09],
+    ),
+    (
+        # Play of ±2: 21, 25, 22, 19 and 20 drag along 21, 23, 23, 21 and 21; a new campaign starts afresh.
+        "bias_thermal_hysteresis",
+        {"height": "4 deg/h", "half_width": "2 degC"},
+        {"time": [0.0, 1, 2, 3, 4, 0, 1], "temperature": [21.0, 25, 22, 19, 20, 30, 29]},
+        [0.0, 4.0, -2.0, -4.0, -2.0, 0.0, -2.0],
+    ),
+    (
+        "rate_hysteresis",
+        {"height": "3 deg/h", "half_width": "0.1 rad/s"},
+        {"time": [0.0, 1, 2, 3], "rate": [0.5, 0.7, 0.65, 0.2]},
+        [0.0, 3.0, 1.5, -3.0],
+    ),
+    (
+        "bias_turn_on",
+        {"offsets": ["2 deg/h", "-1 deg/h"], "runs": ["7", "4"]},
+        {"run": [5.0, 4.0, 7.0, 7.0, 8.0]},
+        [0.0, -1.0, 2.0, 2.0, 0.0],
+    ),
+    ("scale_drift", {"slope": "20 ppm/h"}, {"time": [0.0, 1800.0, 7200.0]}, [0.0, 10.0, 40.0]),
+    (
         "bias_temperature_gradient",
         {"coefficient": "2 deg/h/degC"},
         {"temperature": [20.0, 25.0], "temperature_coil": [20.0, 24.0]},
@@ -266,12 +308,12 @@ BY_HAND = [
         {"time": np.arange(6.0), "rate": DEG_H * np.arange(6.0) ** 3},
         [0.0, *((t - 0.5) ** 3 - t**3 for t in range(1, 6))],
     ),
-    # The lag of a ramp that begins in step: y = t − τ (1 − exp(−t/τ)).
+    # The lag of t²: d = −2τt + 2τ²(1 − exp(−t/τ)).
     (
         "bandwidth",
         {"share": "1", "time_constant": "2 s"},
-        {"time": np.arange(6.0), "rate": DEG_H * np.arange(6.0)},
-        [-2.0 * (1.0 - np.exp(-t / 2.0)) for t in range(6)],
+        {"time": np.arange(6.0), "rate": DEG_H * np.arange(6.0) ** 2},
+        [-4.0 * t + 8.0 * (1.0 - np.exp(-t / 2.0)) for t in range(6)],
     ),
     (
         "output_axis_acceleration",
@@ -280,7 +322,7 @@ BY_HAND = [
             "time": [0.0, 1.0, 3.0, 4.0, 100.0, 101.0],
             "rate_output": [x * DEG_H for x in (0.0, 1.0, 9.0, 16.0, 5.0, 9.0)],
         },
-        [0.5, 1.0, 3.0, 3.5, 2.0, 2.0],
+        [0.0, 1.0, 3.0, 4.0, 2.0, 2.0],
     ),
     ("scale_asymmetry", {"difference": "100 ppm"}, {"rate": [-2.0, 0.0, 2.0]}, [-50.0, 0.0, 50.0]),
     (

@@ -45,19 +45,21 @@ def campaign(rng: np.random.Generator, *wanted: str) -> Campaign:
     names = {name.partition(" or ")[0].replace("<place>", "coil").replace("<axis>", "x") for name in wanted}
     for name in names - {"time", "rate", "temperature"}:
         columns[name], units[name] = rng.uniform(0.5, 1.5, ROWS), usual_unit(name)
+    if "run" in names:
+        columns["run"] = np.arange(ROWS) // 50
     return Campaign(columns, units, {"kind": "rate", "time_since_power_on": 40.0})
 
 
 def filled(label: str, record_signals: Signals, rng: np.random.Generator) -> Effect:
     """The effect at random values below its typical sizes."""
     effect = make_effect(label)
-    if label.endswith("_curve"):
+    if label.endswith("_curve") or label == "temperature_lag":
         effect = type(effect)(coefficients=np.zeros(3), hinges=np.zeros(2), breakpoints=np.array([20.0, 33.0]))  # type: ignore[call-arg]
     effect = effect.prepared(record_signals)
     values = {}
     for name, declared in effect.declared().items():
         # Bands of a dithered lock-in that overlap, as at random values, leave no rate to an output.
-        if name not in ("breakpoints", "time_constant", "share") and label != "lock_in_dithered":
+        if name not in ("breakpoints", "time_constant", "share", "runs") and label != "lock_in_dithered":
             size = declared.typical * factor(declared.unit, internal_unit(declared.unit)) if declared.linear else 1.0
             values[name] = size * jnp.asarray(rng.uniform(0.3, 1.0, np.shape(getattr(effect, name))))
     return replace(effect, **values)
@@ -176,6 +178,12 @@ class Differencing(BiasColumn):
 
     def columns(self, signals):
         return jnp.diff(signals[self.column], prepend=0.0)[:, None]
+
+
+@pytest.mark.parametrize("label", REMEMBERING)
+def test_effects_that_remember_are_refused(label: str):
+    with pytest.raises(ModelError, match=f"{label} cannot be exported to C"):
+        export_calibration(Calibration(GyroModel((SCALE, make_effect(label)))), "c")
 
 
 @pytest.mark.parametrize(

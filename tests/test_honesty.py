@@ -120,12 +120,11 @@ def test_noise_stated_too_large_lacks_nothing(rng: np.random.Generator) -> None:
     assert found.verdict == "adequate"
 
 
-def test_a_bias_that_differs_between_campaigns_follows_the_campaign(rng: np.random.Generator) -> None:
+def test_a_bias_that_differs_between_campaigns_is_a_turn_on_bias(rng: np.random.Generator) -> None:
     runs = [campaign(level + rng.normal(size=ROWS)) for level in (0.0, 5.0)]
     found = gm.diagnose(runs, gm.model_from_effects(["bias"]), hold_out=False)
-    assert found.verdict == "unknown"
-    assert found.driver is not None
-    assert found.driver.column == "campaign"
+    assert (found.verdict, found.causes[0].effect) == ("named", "bias_turn_on")
+    assert found.causes[0].parameters[0].value == pytest.approx(5.0, abs=4 * found.causes[0].parameters[0].std)
     # Steps and lines are not searched across runs, and that is said.
     assert {"bias_step", "bias_periodic"} <= set(found.not_testable)
     assert not {"bias_step", "bias_periodic"} & set(found.searched)

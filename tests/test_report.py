@@ -148,6 +148,7 @@ def made(campaign: Campaign, error: np.ndarray, noise: float, rng: np.random.Gen
             "noise_white": {"value": 0.0123, "lo": 0.0119, "hi": 0.0127, "unit": "deg/sqrt(h)"},
             "noise_random_walk": {"value": 4e-4, "lo": 0.0, "hi": 1.1e-3, "unit": "deg/h/sqrt(h)"},
         },
+        "noise_kinds": {"noise_white": 0.71, "noise_white + noise_random_walk": 0.27},
         "rounds": (
             Round("bias_temperature_rate", 212.4, ranking, spread[1], 180.2),
             Round(None, 0.4, rest, spread[1], 180.2),
@@ -155,7 +156,7 @@ def made(campaign: Campaign, error: np.ndarray, noise: float, rng: np.random.Gen
         "credible_set": {"bias_temperature_rate": 0.9996},
         "unexplained": {"temperature": 0.004, "time": 0.021},
         "findings": ("noise grows with |rate|",),
-        "threshold": 5.0, "threshold_kind": "safe", "searched": SEARCHED, "campaign": campaign,
+        "threshold": 5.0, "threshold_kind": "safe", "p_value": None, "searched": SEARCHED, "campaign": campaign,
         "predicted_before": simulated, "predicted_after": simulated + scale * hidden,
         "residual_before": before, "residual_after": after, "rate_unit": "deg/s",
         "baseline": Fitted(GIVEN),
@@ -195,7 +196,8 @@ def named_static(rng: np.random.Generator, points: int = 18_000) -> Diagnosis:
 
 def adequate(rng: np.random.Generator, points: int = 430) -> Diagnosis:
     base = made(rate_table(rng, points), np.zeros(points), 1.1e-4, rng)
-    return replace(base, verdict="adequate", threshold=7.2, threshold_kind="calibrated", **unchanged(base))
+    calibrated = {"threshold": 7.2, "threshold_kind": "calibrated", "p_value": 0.42}
+    return replace(base, verdict="adequate", **calibrated, **unchanged(base))
 
 
 def ambiguous(rng: np.random.Generator, points: int = 18_000) -> Diagnosis:
@@ -237,7 +239,8 @@ def unknown(rng: np.random.Generator, points: int = 430) -> Diagnosis:
     heat = campaign.columns["temperature"]
     x = np.linspace(heat.min(), heat.max(), 80)
     shape = lambda t: 5e-4 * np.sin(t / 1.7) * np.exp(-((t - 50.0) ** 2) / 40.0)  # noqa: E731
-    driver = Driver("temperature", "degC", x, shape(x), np.full(80, 3e-5), "deg/s")
+    near = {"nearest": "bias_temperature_curve", "nearest_share": 0.41, "behind": 23.4}
+    driver = Driver("temperature", "degC", x, shape(x), np.full(80, 3e-5), "deg/s", **near)
     base = made(campaign, shape(heat), 1.1e-4, rng)
     step = replace(
         base.rounds[0],
@@ -479,7 +482,12 @@ def test_an_unknown_shows_the_function_it_follows(rng: np.random.Generator, tmp_
     assert diagnosis.driver is not None
     computed = replace(diagnosis.driver, column="temperature_rate", unit="degC/s", x=np.linspace(-0.01, 0.01, 80))
     write_report(replace(diagnosis, driver=computed), tmp_path)
-    assert "follows temperature rate" in "".join(read(tmp_path / "report.html").text)
+    text = "".join(read(tmp_path / "report.html").text)
+    assert "follows temperature rate" in text
+    assert "a bias that curves with temperature comes closest: alone it explains 41 % of what" in text
+    assert "Most probably white rate noise" in text
+    write_report(replace(diagnosis, driver=replace(computed, column="temperature_lagged", unit="degC")), tmp_path)
+    assert "follows temperature some time before" in "".join(read(tmp_path / "report.html").text)
 
 
 def test_points_that_stand_apart_are_ringed_with_their_rate(rng: np.random.Generator, tmp_path: Path):

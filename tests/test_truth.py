@@ -9,9 +9,9 @@ from scipy.integrate import quad
 from scipy.stats import binomtest, kstest, kurtosis, norm
 from scipy.stats import t as student_t
 
-from tests.truth import contest, noise, study
-from tests.truth.campaigns import TESTABLE, UNCATALOGUED, A, B, C, hide
-from tests.truth.designs import DESIGNS
+from tests.truth import contest, levels, noise, study
+from tests.truth.campaigns import RUNS, TESTABLE, UNCATALOGUED, A, B, C, hide
+from tests.truth.designs import DESIGNS, RAMP_CODES
 from tests.truth.effects import EFFECTS, UNKNOWN, coil_temperature_rate, draw_shape, error
 from tests.truth.mde import REGULAR, SCAN, amplitude, baseline, oracle, simpler, target
 from tests.truth.motion_designs import MOTION_DESIGNS
@@ -97,7 +97,7 @@ def test_markov_noise_peaks_where_the_table_says(rng):
     ("name", "kind"),
     [
         (name, kind)
-        for name in DESIGNS
+        for name in (A, B, C, RUNS)
         for kind in (*noise.FAMILY, *noise.OUTSIDE)
         if kind != "grows_with_rate" or name in (A, C)
     ],
@@ -152,7 +152,7 @@ def test_designs_are_campaigns_that_could_have_been(name, rng):
 
 
 def test_each_design_does_what_it_is_for(rng):
-    a, b, c, d = (make(rng) for make in DESIGNS.values())
+    a, b, c, d, e, f, g = (make(rng) for make in DESIGNS.values())
     assert len(np.unique(a.columns["segment"])) == 11
     assert np.sum(np.diff(a.index) > 10) == 10
     for segment in range(11):
@@ -167,12 +167,21 @@ def test_each_design_does_what_it_is_for(rng):
     speeds = [np.median(fast[(fast > 0.8 * fast.max())]), -np.median(fast[fast < 0.8 * fast.min()])]
     assert max(speeds) / min(speeds) > 1.3  # at least two ramp speeds
     assert np.mean(np.abs(fast) < 0.15 * np.abs(fast).max()) > 0.1  # soaks
-    levels = np.unique(c.columns["rate"])
-    assert np.sum(levels > 1e-9) >= 10
-    assert np.sum(levels < -1e-9) >= 10
-    assert np.abs(levels).max() <= 100
+    table = np.unique(c.columns["rate"])
+    assert np.sum(table > 1e-9) >= 10
+    assert np.sum(table < -1e-9) >= 10
+    assert np.abs(table).max() <= 100
     assert np.all(np.diff(d.true["temperature"]) >= 0)
     assert np.corrcoef(d.true["temperature"], d.true["time"])[0, 1] > 0.995
+    speed = np.abs(e.true["temperature_rate"])
+    assert np.median(speed) > 0.9 * speed.max()
+    assert len(np.unique(f.columns["run"])) == 6
+    assert np.sum(np.diff(f.index) > 10) == 5
+    assert np.all(np.diff(f.columns["run"])[np.diff(f.index) > 10] == 1)
+    ramp = g.columns["feedback_ramp"]
+    assert np.array_equal(ramp, np.round(ramp))
+    assert 0 <= ramp.min() < 0.02 * ramp.max() < ramp.max() < RAMP_CODES
+    assert np.mean(np.diff(ramp) < 0) > 0.01
 
 
 def test_coil_follows_a_steady_ramp_exactly():
@@ -311,21 +320,21 @@ def test_oracle_names_a_strong_effect_and_least_squares_is_fooled_by_flicker(see
 
 def test_cases_reproduce_and_cover_every_design_and_noise(seed):
     cases = study.effect_cases(17 * 9, seed, 3.0)
-    assert {(c.design, c.noise) for c in cases} == {(d, n) for d in (A, B, C) for n in noise.FAMILY[:3]}
-    assert {c.effect for c in cases} == {e for d in (A, B, C) for e in TESTABLE[d]}
+    assert {(c.design, c.noise) for c in cases} == {(d, n) for d in (A, B, C, RUNS) for n in noise.FAMILY[:3]}
+    assert {c.effect for c in cases} == {e for d in (A, B, C, RUNS) for e in TESTABLE[d]}
     assert len({c.seed for c in cases}) == len(cases)
     one, two = study.build(cases[0]), study.build(cases[0])
     assert all(np.array_equal(one.columns[k], two.columns[k]) for k in one.columns)
 
 
 def test_levels_come_from_the_binomial_law():
-    exact = study.Level("1", "", "", 0.02, False, 2, 400)
+    exact = levels.Level("1", "", "", 0.02, False, 2, 400)
     assert exact.interval == pytest.approx((0.00061, 0.01794), abs=1e-4)  # Clopper-Pearson tables
     assert exact.met
-    assert not study.Level("1", "", "", 0.02, False, 20, 400).met
-    assert study.Level("1", "", "", 0.02, False, 4, 60).plausible
-    assert not study.Level("1", "", "", 0.02, False, 6, 60).plausible
-    assert not study.Level("5", "", "", 0.92, True, 80, 100).plausible
+    assert not levels.Level("1", "", "", 0.02, False, 20, 400).met
+    assert levels.Level("1", "", "", 0.02, False, 4, 60).plausible
+    assert not levels.Level("1", "", "", 0.02, False, 6, 60).plausible
+    assert not levels.Level("5", "", "", 0.92, True, 80, 100).plausible
 
 
 def test_simulators_share_no_code_with_the_package():

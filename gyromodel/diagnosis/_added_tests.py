@@ -7,12 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gyromodel._checks import thermometers
+from gyromodel._checks import accelerations, along_axes, thermometers
 from gyromodel.campaign import Campaign
 from gyromodel.units import from_internal
 
 # Columns that a test cannot step by themselves.
 NOT_SET = ("segment", "run", "position", "rate", "rate_spin", "rate_output", "azimuth")
+# Rates (rad/s) up to which the Earth alone turns the gyro, and to which a table turns it about another axis.
+EARTH, FAST = np.deg2rad(16.0 / 3600.0), np.deg2rad(10.0)
 # How many times as fast the temperature is cycled, and how often up and down at least.
 FASTER, CYCLES = 4, 2
 # Levels of a column that is stepped up and down, and delays tried between two thermometers as parts of the record.
@@ -31,7 +33,9 @@ def added_tests(campaign: Campaign) -> Iterator[AddedTest]:
     yield AddedTest("Repeat the run.", campaign)
     if "temperature" in campaign.columns and np.ptp(campaign.columns["temperature"]) > 0:
         yield from _thermal(campaign)
-    if "rate" in campaign.columns and np.ptp(campaign.columns["rate"]) > 0:
+    cross = along_axes("rate", campaign.columns)
+    yield from _turned(campaign, cross)
+    if "rate" in campaign.columns and np.ptp(campaign.columns["rate"]) > 0 and not _at_rest(campaign):
         rate = campaign.columns["rate"]
         yield AddedTest("Run the same rates with their signs reversed.", _with(campaign, rate=-rate))
         yield AddedTest("Run the same rates in the opposite order.", _with(campaign, rate=rate[::-1]))
@@ -39,15 +43,48 @@ def added_tests(campaign: Campaign) -> Iterator[AddedTest]:
         turned = campaign.columns["azimuth"] + from_internal(np.pi / 2, campaign.units["azimuth"])
         yield AddedTest("Turn the gyro by 90° in azimuth and repeat.", _with(campaign, azimuth=turned))
     for name in campaign.covariates:
-        if name in (*NOT_SET, *thermometers(campaign.columns)) or not np.ptp(campaign.columns[name]) > 0:
+        if (
+            name in (*NOT_SET, *cross, *thermometers(campaign.columns), *accelerations(campaign.columns))
+            or not np.ptp(campaign.columns[name]) > 0
+        ):
             continue
         still = {
             other: np.full(len(campaign), np.median(campaign.columns[other]))
             for other in campaign.covariates
             if other not in NOT_SET
         }
-        stepped = still | {name: _staircase(campaign.columns[name])}
+        stepped = still | {name: _staircase(campaign.columns[name], len(campaign))}
         yield AddedTest(f"Step {name} up and down between its extremes, all else held.", _with(campaign, **stepped))
+
+
+def _at_rest(campaign: Campaign) -> bool:
+    """Whether the Earth is all that turns the gyro, so that no rate can be set by itself."""
+    rates = [n for n in ("rate", *along_axes("rate", campaign.columns)) if n in campaign.columns]
+    return all(np.nanmax(np.abs(campaign.si(n))) < EARTH for n in rates)
+
+
+def _turned(campaign: Campaign, cross: list[str]) -> Iterator[AddedTest]:
+    """Attitudes turned in azimuth, and rates about the other axes one by one."""
+    still = {other: np.full(len(campaign), np.median(campaign.columns[other])) for other in cross}
+    for name in cross:
+        fast = max(FAST, float(np.nanmax(np.abs(campaign.si(name)))))
+        steps = from_internal(_staircase(np.array([-fast, fast]), len(campaign)), campaign.units[name])
+        axis = name.removeprefix("rate_")
+        sentence = f"Turn about the {axis} axis at up to {np.rad2deg(fast):.3g} deg/s both ways, all else held."
+        yield AddedTest(sentence, _with(campaign, **(still | {name: steps})))
+    force = accelerations(campaign.columns)
+    if len(force) == 3 and len(cross) == 2 and "rate" in campaign.columns and _at_rest(campaign):
+        # Columns by axis in one order; the other handedness would be a turn the other way.
+        names = [
+            "rate" if n.replace("acceleration", "rate") not in cross else n.replace("acceleration", "rate")
+            for n in force
+        ]
+        up = np.stack([campaign.si(n) for n in force], axis=1)
+        up = up / np.linalg.norm(up, axis=1, keepdims=True)
+        rates = np.stack([campaign.si(n) for n in names], axis=1)
+        turned = np.sum(rates * up, axis=1, keepdims=True) * up + np.cross(up, rates)
+        new = {n: from_internal(turned[:, i], campaign.units[n]) for i, n in enumerate(names)}
+        yield AddedTest("Turn every attitude by 90° in azimuth and repeat.", _with(campaign, **new))
 
 
 def _thermal(campaign: Campaign) -> Iterator[AddedTest]:
@@ -86,10 +123,10 @@ def _with(campaign: Campaign, **columns: np.ndarray) -> Campaign:
     return campaign
 
 
-def _staircase(values: np.ndarray) -> np.ndarray:
+def _staircase(values: np.ndarray, rows: int) -> np.ndarray:
     """Up and down again in steps between the extremes."""
     levels = np.concatenate([np.arange(LEVELS), np.arange(LEVELS)[::-1]]) / (LEVELS - 1)
-    return values.min() + np.ptp(values) * levels[np.arange(len(values)) * len(levels) // len(values)]
+    return values.min() + np.ptp(values) * levels[np.arange(rows) * len(levels) // rows]
 
 
 def _followed(time: np.ndarray, first: np.ndarray, second: np.ndarray, history: np.ndarray) -> np.ndarray:

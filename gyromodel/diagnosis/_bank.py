@@ -9,15 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from gyromodel._checks import DERIVED, of_usual_unit, usual_unit
+from gyromodel._checks import of_usual_unit, usual_unit
+from gyromodel.diagnosis._drivers import driver_names, is_no_driver, smooths, unusable
 from gyromodel.effects import CATALOGUE, Effect, Signals
 from gyromodel.effects._base import lacking
 from gyromodel.effects.drivers import BiasColumn
 from gyromodel.signals import Record
 
-# Length scales of the smooth functions, as parts of the driver's range.
-SMOOTH_SCALES = (0.08, 0.2, 0.5)
-PAIR_SCALES = (0.25, 0.6)
 # Columns whose linear effect on the bias is in the catalogue, is the scale factor, or means nothing.
 OWN_EFFECTS = ("rate", "temperature", "campaign")
 # The effect that follows a column in its own way, so that a bias proportional to the column is not searched besides.
@@ -36,15 +34,14 @@ OWNERS = (
     | {f"magnetic_field_{axis}": "bias_magnetic" for axis in "xyz"}
     | {f"rate_{axis}": "misalignment" for axis in "xyz"}
 )
-# What `compensate` adds is the output itself.
-NOT_DRIVERS = ("time", "output", "segment", "run", "position", "rate_estimated", "rate_estimated_std")
 
 
 @dataclass(frozen=True)
 class Block:
     """Columns of one form of one candidate; they stand at `start` … `start + width` of the bank.
 
-    Forms of one `structure` differ only in the values of nonlinear parameters.
+    Forms of one `structure` differ only in the values of nonlinear parameters. `along` is what a driver's first column
+    is drawn over.
     """
 
     name: str
@@ -53,6 +50,7 @@ class Block:
     width: int
     structure: str
     effect: Effect | None
+    along: np.ndarray | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True)
@@ -74,11 +72,6 @@ class Bank:
         return {q: (widths.index(q), widths.count(q), self.blocks[widths.index(q)].start) for q in sorted(set(widths))}
 
 
-def driver_names(record: Record) -> tuple[str, ...]:
-    """Measured columns that vary: what an unknown discrepancy may follow, besides time."""
-    return tuple(n for n in record.signals if not _is_no_driver(n) and not _unusable(record, n))
-
-
 def _usable(record: Record) -> dict[str, Array]:
     """Signals less the columns that catalogue effects cannot take for their unit."""
     return {n: v for n, v in record.signals.items() if of_usual_unit(n, record.units.get(n, usual_unit(n)))}
@@ -87,10 +80,6 @@ def _usable(record: Record) -> dict[str, Array]:
 def _is_owned(record: Record, name: str) -> bool:
     """Whether a column's linear effect on the bias has another name than the column's."""
     return name in OWN_EFFECTS or (name in OWNERS and of_usual_unit(name, record.units[name]))
-
-
-def _is_no_driver(name: str) -> bool:
-    return name in NOT_DRIVERS or bool(DERIVED.fullmatch(name))
 
 
 def build_bank(record: Record) -> Bank:
@@ -116,9 +105,11 @@ def build_bank(record: Record) -> Bank:
             forms = kind.candidates(signals)
             if not forms:
                 not_testable[name] = kind.untested
+            elif part := kind.hidden(signals):
+                not_testable[f"part of {name}"] = part
             blocks.extend((name, "effect", _weighted(e, signals, rate), e) for e in forms)
     for name in record.signals:
-        reason = "" if _is_no_driver(name) else _unusable(record, name)
+        reason = "" if is_no_driver(name) else unusable(record, name)
         if reason:
             not_testable |= {f"smooth({name})": reason} | (
                 {} if _is_owned(record, name) else {BiasColumn(column=name).label: reason}
@@ -126,14 +117,18 @@ def build_bank(record: Record) -> Bank:
     for name in [n for n in driver_names(record) if not _is_owned(record, n)]:
         effect = BiasColumn(column=name).prepared(record.signals)
         blocks.append((effect.label, "effect", _weighted(effect, record.signals, rate), effect))
-    for name, shape in _smooths(record):
+    along = {}
+    for name, values, shape in smooths(record):
+        along[len(blocks)] = values
         blocks.append((name, "driver", shape, None))
-    blocks.sort(key=lambda b: b[2].shape[1])
+    order = sorted(range(len(blocks)), key=lambda i: blocks[i][2].shape[1])
     laid, start = [], 0
-    for name, kind_of, shape, effect in blocks:
-        laid.append(Block(name, kind_of, start, shape.shape[1], _structure(name, effect, shape.shape[1]), effect))
+    for i in order:
+        name, kind_of, shape, effect = blocks[i]
+        width = shape.shape[1]
+        laid.append(Block(name, kind_of, start, width, _structure(name, effect, width), effect, along.get(i)))
         start += shape.shape[1]
-    columns = np.concatenate([b[2] for b in blocks], axis=1) if blocks else np.zeros((len(rate), 0))
+    columns = np.concatenate([blocks[i][2] for i in order], axis=1) if blocks else np.zeros((len(rate), 0))
     return Bank(columns, tuple(laid), tuple(scans), not_testable)
 
 
@@ -149,18 +144,9 @@ def _missing(kind: type[Effect], record: Record) -> str:
     for name in kind.needs:
         if lacking((name,), usable):
             return f"needs a column {name}" + (f" in a unit like {usual_unit(name)}" if name in record.signals else "")
-        if name in record.signals and (reason := _unusable(record, name)):
+        if name in record.signals and (reason := unusable(record, name)):
             return reason
     return ""
-
-
-def _unusable(record: Record, name: str) -> str:
-    """Why a column cannot be searched; empty where it can."""
-    values = np.asarray(record.signals[name])[: record.rows][record.present]
-    missing = int((~np.isfinite(values)).sum())
-    if missing:
-        return f"{name} is missing in {missing} of {len(values)} rows"
-    return "" if np.ptp(values) > 0 else f"{name} does not vary"
 
 
 def _weighted(effect: Effect, signals: Signals, rate: np.ndarray) -> np.ndarray:
@@ -169,40 +155,3 @@ def _weighted(effect: Effect, signals: Signals, rate: np.ndarray) -> np.ndarray:
         return rate[:, None]
     columns = np.asarray(effect.columns(signals))
     return columns * rate[:, None] if effect.site == "scale" else columns
-
-
-def _smooths(record: Record) -> list[tuple[str, np.ndarray]]:
-    names = driver_names(record)
-    found = [
-        (f"smooth({name})", s) for name in (*names, "time") for s in _kernel_features(record, (name,), SMOOTH_SCALES)
-    ]
-    rate_first = sorted(names, key=lambda n: n not in ("rate", "temperature"))[:3]
-    pairs = [(a, b) for i, a in enumerate(rate_first) for b in rate_first[i + 1 :]]
-    return found + [(f"smooth({a}, {b})", s) for a, b in pairs for s in _kernel_features(record, (a, b), PAIR_SCALES)]
-
-
-def _unit_interval(record: Record, name: str) -> np.ndarray:
-    values = np.asarray(record.signals[name])
-    low, high = values[: record.rows].min(), values[: record.rows].max()
-    return (values - low) / (high - low)
-
-
-def _kernel_features(record: Record, names: tuple[str, ...], scales: tuple[float, ...]) -> list[np.ndarray]:
-    """Gaussian bumps one length scale apart, of one column or of the product of two."""
-    found = []
-    for scale in scales:
-        per_column = []
-        for name in names:
-            centres = np.linspace(0.0, 1.0, round(1.0 / scale) + 1)
-            distance = (_unit_interval(record, name)[:, None] - centres) / scale
-            per_column.append(np.exp(-0.5 * distance**2))
-        shape = per_column[0]
-        for other in per_column[1:]:
-            shape = (shape[:, :, None] * other[:, None, :]).reshape(len(shape), -1)
-        found.append(shape)
-    return found
-
-
-def smooth_columns(name: str) -> tuple[str, ...]:
-    """The columns a driver candidate's name holds: "smooth(rate, temperature)" → (rate, temperature)."""
-    return tuple(part.strip() for part in name.removeprefix("smooth(").removesuffix(")").split(","))

@@ -16,7 +16,7 @@ from gyromodel.diagnosis._calibrate import null_scores
 from gyromodel.diagnosis._evidence import SAFE_THRESHOLD
 from gyromodel.diagnosis._gain import ladder_error, nested_gain, no_gain, not_measured
 from gyromodel.diagnosis._isolation import settling_test
-from gyromodel.diagnosis._ranking import Ranking, cells_of_weight, is_driver, is_noise
+from gyromodel.diagnosis._ranking import Ranking, cells_of_weight, is_driver, is_noise, noise_kinds
 from gyromodel.diagnosis._result import Candidate, Diagnosis, Gain, Round
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import Found, NoisePath, Progress, Selection, search, standing
@@ -168,15 +168,17 @@ def diagnose(
         gain=gain,
         next_test=next_test,
         minimum_detectable=minimum_detectable(session.scanner, selection.last, session.threshold, unit),
-        not_testable=bank.not_testable | not_testable(session.scanner, selection.last, selection.estimate.model),
+        not_testable=not_testable(session.scanner, selection.last, selection.estimate.model),
         noise=extended.noise_table(),
+        noise_kinds={} if baseline.noise_given else noise_kinds(session.scanner, selection.last),
         rounds=_rounds(session, selection, scale, hold_out),
         credible_set=judgement.credible_set,
         unexplained=judgement.unexplained,
         findings=(*findings, *judgement.findings),
         threshold=session.threshold,
         threshold_kind="calibrated" if calibrate else "safe",
-        searched=bank.names(),
+        p_value=_p_value(selection, nulls) if calibrate else None,
+        searched=(*bank.names(), *selection.last.tangents),
         campaign=whole,
         predicted_before=from_internal(before, output_unit),
         predicted_after=from_internal(after, output_unit),
@@ -213,6 +215,12 @@ def _rate_unit(campaign: Campaign) -> str:
         if name in campaign.units and convertible(campaign.units[name], "rad/s"):
             return campaign.units[name]
     return "deg/s"
+
+
+def _p_value(selection: Selection, nulls: np.ndarray) -> float:
+    """Share of campaigns with nothing hidden whose best candidate has as much evidence; this one is counted."""
+    first = selection.path[0].ranking if selection.path else selection.last
+    return float((1 + np.sum(nulls >= first.score)) / (1 + len(nulls)))
 
 
 def _gain(session: _Session, baseline: Estimate, selection: Selection, unit: str, scale: float, ordinary, say) -> Gain:

@@ -23,7 +23,7 @@ from gyromodel.noise import NoiseRatios
 from gyromodel.signals import Record, read_signals, with_columns_known
 from gyromodel.units import factor, internal_unit
 
-# Two signals this many standard deviations apart are taken for one another in 5 % of campaigns: Φ(−d/2).
+# Two signals of one size, this many standard deviations apart, are taken for one another in 5 % of campaigns: Φ(−d/2).
 APART = 3.29
 # Added to the size that just reaches the threshold, so that noise leaves it there with 80 %.
 POWER = 0.84
@@ -32,6 +32,8 @@ STEPS, VANISHED = 25, 1e-6
 # A test is worth asking for if it brings two effects this many times as far apart; repeating all gives 1.4. More than
 # MOST counts no more.
 WORTHWHILE, MOST = 1.5, 100.0
+# A test that leaves two effects closer than this would have to be done a hundred times.
+LEAST = APART / 10.0
 
 
 class View:
@@ -74,7 +76,7 @@ def _forms(effect: Effect, signals: Signals) -> list[Effect]:
 
 
 def nearest(view: View, truths: Sequence[Effect]) -> tuple[float, str, str]:
-    """The least distance of one of the effects, as it is, from the best form of another, and the names of the two.
+    """The least distance of one of the effects, as it is, from another of its size, and the names of the two.
 
     In standard deviations; pairs of which one contains the other are left out.
     """
@@ -86,9 +88,16 @@ def nearest(view: View, truths: Sequence[Effect]) -> tuple[float, str, str]:
         for truth, signal in zip(truths, left, strict=True):
             if truth is rival or truth.label in rival.supersedes or rival.label in truth.supersedes:
                 continue
-            distance = min(float(np.linalg.norm(signal - b @ (b.T @ signal))) for b in bases)
+            distance = min(_distance(signal, b) for b in bases)
             found.append((distance, truth.label, rival.label))
     return min(found)
+
+
+def _distance(signal: np.ndarray, basis: np.ndarray) -> float:
+    """Distance of a signal from the nearest one of its size in a span."""
+    taken = basis.T @ signal
+    sine, own = np.linalg.norm(signal - basis @ taken), np.linalg.norm(signal)
+    return float(sine * np.sqrt(2.0 * own / (own + np.linalg.norm(taken)))) if own else 0.0
 
 
 def settling_test(
@@ -120,7 +129,7 @@ def settling_test(
     now = distance()[0]
     tried = [(*distance(_output_known(test.campaign, 1)), test.sentence) for test in added_tests(campaigns[-1])]
     reached, *closest, sentence = max(tried, key=lambda t: t[0])
-    if not reached > WORTHWHILE * now:
+    if not reached > max(WORTHWHILE * now, LEAST):
         return None
     again = "" if reached >= APART else f" Do it {int(np.ceil((APART / reached) ** 2))} times."
     return (
@@ -281,8 +290,8 @@ def _sizes(
         if a in forms[b][0].supersedes or b in forms[a][0].supersedes:
             continue
         alike = np.median([max(_cosine(x, y) for y in bases[b]) for x in bases[a]])
-        sine = float(np.sqrt(max(1.0 - alike**2, 0.0)))
-        apart[a, b] = size(a, APART / sine if sine > VANISHED else np.inf)
+        each = float(np.sqrt(2.0 * max(1.0 - alike, 0.0)))
+        apart[a, b] = size(a, APART / each if each > VANISHED else np.inf)
     return detectable, apart, not_testable
 
 

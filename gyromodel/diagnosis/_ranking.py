@@ -9,14 +9,18 @@ import numpy as np
 
 from gyromodel._checks import thermometers
 from gyromodel.diagnosis._evidence import log_sum
-from gyromodel.diagnosis._scan import CellResult, Scanner
+from gyromodel.diagnosis._scan import CellResult, Scanner, Tangent
+from gyromodel.effects import CATALOGUE
+from gyromodel.effects._base import evaluate
 from gyromodel.effects.drivers import BiasColumn, BiasPeriodic
 from gyromodel.estimate import Estimate
-from gyromodel.model import GyroModel
+from gyromodel.model import GyroModel, effect_class
 
 # Cells within this many nats of the best, for any candidate that matters, get their neighbours searched too: those
 # better than nothing added and not hopelessly behind the best.
 NEARBY, HOPELESS = 7.0, 30.0
+# What explains all but this part of what another explains is the same signal.
+ALIKE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -30,11 +34,13 @@ class Ranking:
     slow: dict[int, bool] = field(repr=False)
     walks: dict[int, bool] = field(repr=False)
     baseline_columns: np.ndarray = field(repr=False)
+    tangents: dict[str, Tangent] = field(default_factory=dict, repr=False)
 
     def best(self, *, drivers: bool, but: tuple[str, ...] = ()) -> tuple[str | None, float]:
         """The best unknown driver, or the best named candidate (but some), and its evidence ratio (ln)."""
         mine = {k: v for k, v in self.statistic.items() if is_driver(k) == drivers and k not in but}
-        top = max(mine, key=lambda k: mine[k]) if mine else None
+        # Of names that are the same on this campaign the first, whatever the rounding.
+        top = max(mine, key=lambda k: round(mine[k], 6)) if mine else None
         return top, mine[top] if top else -np.inf
 
     @property
@@ -59,6 +65,22 @@ class Ranking:
     def best_form(self, name: str) -> tuple[int | tuple[int, ...], float, float]:
         """Form, explained sum and dimension of a candidate where it is best."""
         return self.results[self.best_cell(name)].best[name]
+
+    def twins(self, name: str) -> set[str]:
+        """Effects that explain as much of the data as a candidate, with at most one coefficient more.
+
+        Their signals hold the candidate's: no size of it would tell them apart on this campaign. Of those that contain
+        one another only the simplest counts.
+        """
+        best = self.results[self.best_cell(name)].best
+        _, explained, q = best[name]
+        alike = {
+            k
+            for k, (_, t, width) in best.items()
+            if k != "outliers" and k in self.statistic and not is_driver(k) and not is_noise(k)
+            and width <= q + 1 and t >= (1.0 - ALIKE) * explained
+        }  # fmt: skip
+        return {k for k in alike - {name} if not alike & set(effect_class(k).supersedes) - {k}}
 
 
 def is_driver(name: str) -> bool:
@@ -94,11 +116,17 @@ def rank(
         for b in scanner.bank.blocks
         if b.effect is not None and b.effect.supersedes
     }
+    continued = tangents(scanner, estimate.model, skip)
     families = scanner.noise_families() if estimate.noise_given else {}
     wanted = sorted({*cells, *(g for f in families.values() for g in f)})
     everything = dict(known or {})
     everything |= scanner.run(
-        [g for g in wanted if g not in everything], columns, residual, contained, line_frequencies(estimate.model)
+        [g for g in wanted if g not in everything],
+        columns,
+        residual,
+        contained,
+        line_frequencies(estimate.model),
+        list(continued.values()),
     )
     results = {g: everything[g] for g in cells}
     prior = scanner.grid.log_prior
@@ -123,7 +151,17 @@ def rank(
     walk, flicker = scanner.grid.ratios.walk, scanner.grid.ratios.flicker
     slow = {g: float(walk[g]) > 0 or float(flicker[g]) > 0 for g in cells}
     walks = {g: float(walk[g]) > 0 for g in cells}
-    return Ranking(statistic, posterior, results, prior, slow, walks, columns)
+    return Ranking(statistic, posterior, results, prior, slow, walks, columns, continued)
+
+
+def tangents(scanner: Scanner, model: GyroModel, skip: set[str]) -> dict[str, Tangent]:
+    """Candidates that continue effects of a model, where nothing but their absence keeps them from being searched."""
+    found = {}
+    for name, kind in CATALOGUE.items():
+        effect = kind.continuing(model.effects) if scanner.bank.not_testable.get(name) == kind.untested else None
+        if effect is not None and name not in skip:
+            found[name] = Tangent(effect, np.asarray(evaluate(effect, scanner.record.signals)[1][:, -1]))
+    return found
 
 
 def rank_where_it_matters(scanner: Scanner, estimate: Estimate, pulses: tuple[int, ...]) -> Ranking:
@@ -149,6 +187,19 @@ def cells_of_weight(ranking: Ranking, nats: float) -> list[int]:
         best = max(of.values())
         near |= {g for g, v in of.items() if v > best - nats}
     return sorted(near)
+
+
+def noise_kinds(scanner: Scanner, ranking: Ranking) -> dict[str, float]:
+    """Posterior over what the noise is made of with nothing more added, the likeliest first."""
+    weight: dict[str, float] = {}
+    logs = {g: r.log_likelihood + ranking.log_prior[g] for g, r in ranking.results.items()}
+    total = log_sum(list(logs.values()))
+    flicker, walk = scanner.grid.ratios
+    for g, v in logs.items():
+        parts = (("noise_white", True), ("noise_flicker", flicker[g] > 0), ("noise_random_walk", walk[g] > 0))
+        kind = " + ".join(name for name, there in parts if there)
+        weight[kind] = weight.get(kind, 0.0) + float(np.exp(v - total))
+    return dict(sorted(weight.items(), key=lambda item: -item[1]))
 
 
 def line_frequencies(model: GyroModel) -> np.ndarray:

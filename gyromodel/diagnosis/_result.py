@@ -84,7 +84,12 @@ class Gain:
 
 @dataclass(frozen=True)
 class Driver:
-    """The smooth function of one column (or of time) that an unknown discrepancy follows, with its standard error."""
+    """The smooth function of one column (or of time) that an unknown discrepancy follows, with its standard error.
+
+    `column` may end in _rate (its rate of change) or _lagged (its value some time before). `nearest` is the catalogue
+    effect that comes closest, `nearest_share` what part of the curve's work it does, `behind` by how many nats of
+    evidence it is beaten.
+    """
 
     column: str
     unit: str
@@ -92,11 +97,19 @@ class Driver:
     y: np.ndarray
     std: np.ndarray
     y_unit: str
+    nearest: str = ""
+    nearest_share: float = 0.0
+    behind: float = 0.0
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The whole answer; arrays have one entry per campaign row, residuals are measured minus model as a rate."""
+    """The whole answer; arrays have one entry per campaign row, residuals are measured minus model as a rate.
+
+    `noise_kinds` is the posterior over what the noise is made of, "noise_white" alone or more joined by " + "; empty
+    where the model states it. `p_value` is the chance that a campaign of this design with nothing hidden shows as much
+    evidence as this one; None if the threshold was not calibrated.
+    """
 
     verdict: Verdict
     causes: tuple[Cause, ...]
@@ -106,12 +119,14 @@ class Diagnosis:
     minimum_detectable: Mapping[str, tuple[float, str]]
     not_testable: Mapping[str, str]
     noise: Mapping[str, Mapping[str, float | str]]
+    noise_kinds: Mapping[str, float]
     rounds: tuple[Round, ...]
     credible_set: Mapping[str, float]
     unexplained: Mapping[str, float]
     findings: tuple[str, ...]
     threshold: float
     threshold_kind: Literal["safe", "calibrated"]
+    p_value: float | None
     searched: tuple[str, ...]
     campaign: Campaign = field(repr=False)
     predicted_before: np.ndarray = field(repr=False)
@@ -128,7 +143,8 @@ class Diagnosis:
         if self.driver is not None:
             d = self.driver
             shape = {"x": d.x.tolist(), "y": d.y.tolist(), "std": d.std.tolist(), "x_unit": d.unit, "y_unit": d.y_unit}
-            driver = {"column": d.column, "shape": shape}
+            nearest = {"effect": d.nearest, "share": d.nearest_share, "behind": d.behind} if d.nearest else None
+            driver = {"column": d.column, "shape": shape, "nearest": nearest}
         return {
             "verdict": self.verdict,
             "causes": [asdict(c) for c in self.causes],
@@ -138,11 +154,13 @@ class Diagnosis:
             "minimum_detectable": {k: {"size": s, "unit": u} for k, (s, u) in self.minimum_detectable.items()},
             "not_testable": dict(self.not_testable),
             "noise": {k: dict(v) for k, v in self.noise.items()},
+            "noise_kinds": dict(self.noise_kinds),
             "credible_set": dict(self.credible_set),
             "unexplained": dict(self.unexplained),
             "findings": list(self.findings),
             "rounds": [asdict(r) for r in self.rounds],
             "threshold": self.threshold,
             "threshold_kind": self.threshold_kind,
+            "p_value": self.p_value,
             "searched": list(self.searched),
         }

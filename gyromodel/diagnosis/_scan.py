@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +24,7 @@ from gyromodel.diagnosis._cells import Cell, Cells, precision
 from gyromodel.diagnosis._evidence import log_evidence_ratio, log_mean, log_mean_of_parts
 from gyromodel.diagnosis._lines import PEAK_WIDTH, PEAKS, line_grid
 from gyromodel.diagnosis._points import explained_by, robust_order
+from gyromodel.effects import Effect
 from gyromodel.noise import NoiseGrid
 from gyromodel.signals import Record
 
@@ -75,6 +77,34 @@ class Batch:
         }
         evidence = {name: float(v[0]) for name, v in self.evidence.items()}
         return CellResult(float(self.log_likelihood[0]), float(self.rss[0]), evidence, best, self.energy, self.peaks)
+
+
+class Tangent(NamedTuple):
+    """A candidate that continues effects of the baseline: its derivative by its amplitude there."""
+
+    effect: Effect
+    column: np.ndarray
+
+
+def _tangents(batch: Batch, tangents: Sequence[Tangent], x: np.ndarray, z: np.ndarray, p: int, nu: int) -> None:
+    """Evidence of the candidates whose columns stand first in x, before p of the baseline and the residuals."""
+    first = len(tangents)
+    if not first:
+        return
+    left = x[:, : first + p].T @ z
+    own, cross, data = left[:first, :first], left[:first, first : first + p], left[:, first + p :]
+    inner = np.linalg.lstsq(left[first:, first : first + p], np.column_stack([cross.T, data[first:]]), rcond=1e-13)[0]
+    energy = np.diag(own - cross @ inner[:, :first])
+    along = data[:first] - cross @ inner[:, first:]
+    for tangent, size, norm, b in zip(tangents, energy, np.diag(own), along, strict=True):
+        name = tangent.effect.id
+        batch.energy[name] = np.array([size if size > VANISHED * norm else 0.0])
+        if size > VANISHED * norm:
+            # What the amplitude explains that is best within the effect's reach.
+            best = np.clip(b / size, -tangent.effect.reach, tangent.effect.reach)
+            t = np.minimum(2.0 * best * b - best**2 * size, batch.rss)
+            batch.evidence[name] = log_evidence_ratio(t, batch.rss, nu, 1)
+            batch.best[name] = ([0] * len(t), t, np.ones(len(t)))
 
 
 class Scanner:
@@ -161,6 +191,7 @@ class Scanner:
         residual: np.ndarray,
         contained: dict[str, int],
         lines: np.ndarray = NO_LINES,
+        tangents: Sequence[Tangent] = (),
     ) -> dict[int, CellResult]:
         """Evaluate every candidate against a baseline in the given noise cells.
 
@@ -170,8 +201,9 @@ class Scanner:
             residual: measured minus predicted, as a rate.
             contained: how many of a candidate's columns the baseline already has, by name.
             lines: frequencies (Hz) of the baseline's lines.
+            tangents: candidates that continue effects of the baseline.
         """
-        batches = self.run_many(cells, jacobian, residual[:, None], contained, lines)
+        batches = self.run_many(cells, jacobian, residual[:, None], contained, lines, tangents)
         return {g: batch.first() for g, batch in zip(cells, batches, strict=True)}
 
     def run_many(
@@ -181,19 +213,26 @@ class Scanner:
         residuals: np.ndarray,
         contained: dict[str, int],
         lines: np.ndarray = NO_LINES,
+        tangents: Sequence[Tangent] = (),
     ) -> list[Batch]:
         """As `run`, for many residuals of one baseline at once (one a column); cells in the order given."""
         spare = np.array([contained.get(b.name, 0) for b in self.bank.blocks])
         drivers = np.array([b.kind == "driver" for b in self.bank.blocks], bool)
         least = np.where(drivers, 1, np.maximum(self._widths - spare, 1))
-        stacked = np.where(self.present[:, None], np.column_stack([jacobian, residuals]), 0.0)
-        p = jacobian.shape[1]
+        stacked = np.column_stack([*(t.column for t in tangents), jacobian, residuals])
+        stacked = np.where(self.present[:, None], stacked, 0.0)
+        p, first = jacobian.shape[1], len(tangents)
         # What follows a line closely is a line that is not steady, and no other line.
         barred = self.lines.unresolved(lines) if self.lines else np.zeros(0, bool)
 
         def search(group: Sequence[int]) -> list[Batch]:
             z, cross = self.cells.inner_products(group, stacked)
-            return [self._run_cell(g, stacked, z[i], cross[i], p, least, barred) for i, g in enumerate(group)]
+            batches = []
+            for i, g in enumerate(group):
+                x, zi = stacked[:, first:], z[i][:, first:]
+                batches.append(batch := self._run_cell(g, x, zi, cross[i][:, first:], p, least, barred))
+                _tangents(batch, tangents, stacked, z[i], p, self.degrees_of_freedom - p)
+            return batches
 
         # Cells share the cores; BLAS threads on top of them would only wait for one another.
         with _libraries().limit(limits=1, user_api="blas"), ThreadPoolExecutor(THREADS) as pool:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from gyromodel.diagnosis._bank import smooth_columns
+from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._evidence import log_evidence_ratio, log_sum
 from gyromodel.diagnosis._lines import RESOLVED
 from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise, line_frequencies, rank_where_it_matters
-from gyromodel.diagnosis._scan import Scanner
+from gyromodel.diagnosis._scan import Scanner, Tangent
 from gyromodel.effects import Effect
 from gyromodel.effects.drivers import BiasPeriodic, BiasStep
 from gyromodel.estimate import Estimate, EstimateError, fit_record
@@ -194,6 +195,10 @@ def _addition(scanner: Scanner, estimate: Estimate, ranking: Ranking, name: str,
         rows = form if isinstance(form, tuple) else (form,)
         return Found(name, None, tuple(int(r) for r in rows), ranking)
     assert isinstance(form, int)
+    if name in ranking.tangents:
+        return Found(
+            name, _grown(scanner, estimate, ranking.tangents[name], ranking.best_cell(name), pulses), (), ranking
+        )
     fixed = [e for e in estimate.model.effects if e.label == name and name in estimate.model.wholly_fixed()]
     effect = fixed[0] if fixed else form_effect(scanner, name, form)
     assert effect is not None
@@ -238,11 +243,28 @@ def form_effect(scanner: Scanner, name: str, form: int) -> Effect | None:
 
 def _solved(scanner: Scanner, estimate: Estimate, effect: Effect, g: int, pulses: tuple[int, ...]) -> Effect:
     """The effect at the coefficients that fit best beside the baseline, in one noise cell."""
-    record = scanner.record
     model = estimate.model
     model = GyroModel(tuple(e for e in model.effects if e.label not in effect.supersedes), {}, model.fixed, model.gyro)
+    if effect.site == "gain":
+        return effect
+    columns = model.columns_of(effect, scanner.record.signals)
+    return effect.with_linear(_coefficients(scanner, model, columns, g, pulses))
+
+
+def _grown(scanner: Scanner, estimate: Estimate, tangent: Tangent, g: int, pulses: tuple[int, ...]) -> Effect:
+    """An effect that continues others, at the amplitude that fits best beside them."""
+    effect, column = tangent.effect, jnp.asarray(tangent.column)[:, None] * estimate.model.gain()
+    best = _coefficients(scanner, estimate.model, column, g, pulses)
+    name = [k for k, declared in effect.declared().items() if not declared.linear][-1]
+    return replace(effect, **{name: jnp.clip(best[0], -effect.reach, effect.reach)})
+
+
+def _coefficients(
+    scanner: Scanner, model: GyroModel, columns: Array, g: int, pulses: tuple[int, ...]
+) -> Float[Array, " coefficient"]:
+    """The coefficients of columns that fit best beside a model, in one noise cell."""
+    record = scanner.record
     predicted, jacobian = model.linearise(record.signals)
-    columns = model.columns_of(effect, record.signals)
     residual = jnp.where(record.sampling.present, record.signals["output"] - predicted, 0.0)
     marks = jnp.zeros((len(residual), len(pulses))).at[jnp.asarray(pulses, int), jnp.arange(len(pulses))].set(1.0)
     stacked = jnp.column_stack([jacobian, marks, columns, residual])
@@ -250,10 +272,7 @@ def _solved(scanner: Scanner, estimate: Estimate, effect: Effect, g: int, pulses
     norm = np.linalg.norm(w[:, :-1], axis=0)
     norm[norm == 0] = 1.0
     solution = np.linalg.lstsq(w[:, :-1] / norm, w[:, -1], rcond=1e-9)[0] / norm
-    coefficients = solution[-columns.shape[1] :]
-    if effect.site == "gain":
-        return effect
-    return effect.with_linear(jnp.asarray(coefficients))
+    return jnp.asarray(solution[-columns.shape[1] :])
 
 
 def refit(record: Record, baseline: Estimate, found: list[Found], noise: NoisePath = ()) -> Estimate | None:

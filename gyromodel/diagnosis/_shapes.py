@@ -5,9 +5,9 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from gyromodel.diagnosis._bank import smooth_columns
+from gyromodel.diagnosis._drivers import driver_unit, smooth_columns
 from gyromodel.diagnosis._evidence import explained_for
-from gyromodel.diagnosis._ranking import Ranking, is_driver, skipped
+from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise, skipped
 from gyromodel.diagnosis._result import Driver
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import (
@@ -29,6 +29,8 @@ def _columns(scanner: Scanner, ranking: Ranking, name: str) -> np.ndarray | None
         marks = np.zeros((len(scanner.present), len(rows)))
         marks[list(rows), np.arange(len(rows))] = 1.0
         return marks
+    if name in ranking.tangents:
+        return ranking.tangents[name].column[:, None]
     assert isinstance(form, int)
     effect = form_effect(scanner, name, form)
     if name in ("bias_step", "bias_periodic"):
@@ -109,13 +111,27 @@ def driver_shape(scanner: Scanner, selection: Selection, name: str, unit: str) -
     shape = shape - shape.mean(0)
     value = shape @ solution[p:]
     std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", shape, covariance[p:, p:], shape), 0.0))
-    column = smooth_columns(name)[0]
-    file_unit = record.units.get(column, "s")
-    x = np.asarray(record.signals[column])[: record.rows]
+    form, explained, _ = ranking.best_form(name)
+    along = scanner.bank.blocks[int(np.asarray(form))].along
+    assert along is not None
+    file_unit, x = driver_unit(record, smooth_columns(name)[0]), along[: record.rows]
     order = np.argsort(x)[:: max(1, record.rows // 300)]
     scale = factor("rad/s", unit)
     label = " and ".join(smooth_columns(name))
-    return Driver(label, file_unit, from_internal(x[order], file_unit), value[order] * scale, std[order] * scale, unit)
+    found = from_internal(x[order], file_unit), value[order] * scale, std[order] * scale
+    return Driver(label, file_unit, *found, unit, *_nearest(ranking, name, explained))
+
+
+def _nearest(ranking: Ranking, driver: str, explained: float) -> tuple[str, float, float]:
+    """The catalogue effect of most evidence beside a driver: its share of what the curve explains, and how far behind.
+
+    Empty where none has any evidence.
+    """
+    name, statistic = ranking.best(drivers=False, but=("outliers",))
+    if name is None or statistic <= 0 or is_noise(name):
+        return "", 0.0, 0.0
+    share = ranking.best_form(name)[1] / explained
+    return name, float(min(share, 1.0)), float(ranking.statistic[driver] - statistic)
 
 
 def minimum_detectable(scanner: Scanner, ranking: Ranking, threshold: float, unit: str) -> dict[str, tuple[float, str]]:
@@ -133,6 +149,12 @@ def minimum_detectable(scanner: Scanner, ranking: Ranking, threshold: float, uni
         q = widths[name].width if name in widths else (2 if name == "bias_periodic" else 1)
         needed = np.sqrt(explained_for(threshold + np.log(len(energy)), nu, q)) + 0.84
         size = float(needed * sigma / np.sqrt(np.median(energy)))
+        if name in ranking.tangents:
+            kind = ranking.tangents[name].effect
+            unit_of = [p.unit for p in kind.declared().values() if not p.linear][-1]
+            size = float(needed * sigma / np.sqrt(energy[0]))
+            sizes[name] = size * factor(internal_unit(unit_of), unit_of), unit_of
+            continue
         sizes[name] = _in_unit(scanner, name, widths[name].effect if name in widths else None, q, size, unit)
     return sizes
 
@@ -148,10 +170,12 @@ def _in_unit(scanner: Scanner, name: str, effect: Effect | None, q: int, size: f
 
 
 def not_testable(scanner: Scanner, ranking: Ranking, model: GyroModel) -> dict[str, str]:
-    """Candidates that a model does not have and whose columns vanish beside it, with the reason."""
+    """Candidates that a campaign cannot show, and those whose columns vanish beside a model, with the reason."""
     result = ranking.results[ranking.best_cell()]
-    return {
+    tried = {b.name for b in scanner.bank.blocks if b.kind == "effect"} | set(ranking.tangents)
+    reasons = {k: v for k, v in scanner.bank.not_testable.items() if k not in (*tried, *model.labels)}
+    return reasons | {
         name: "cannot be told from what the model already has on this campaign"
-        for name in {b.name for b in scanner.bank.blocks if b.kind == "effect"} - skipped(model, scanner.record.signals)
+        for name in tried - skipped(model, scanner.record.signals)
         if name not in result.evidence and not (result.energy.get(name, np.zeros(1)) > 0).any()
     }

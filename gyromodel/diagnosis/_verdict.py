@@ -8,8 +8,8 @@ from math import comb
 import numpy as np
 from scipy import stats
 
-from gyromodel.diagnosis._bank import smooth_columns
-from gyromodel.diagnosis._ranking import Ranking, is_driver
+from gyromodel.diagnosis._drivers import smooth_columns
+from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise
 from gyromodel.diagnosis._result import Cause, Confuser, ParameterValue, Verdict
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import (
@@ -59,6 +59,9 @@ def credible(
     own = {k: v for k, v in ranking.statistic.items() if not is_driver(k) and (k == name or k not in apart)}
     hidden_by_walk = name in NO_EDGE and ranking.walks[ranking.best_cell(name)]
     too_close = name in SLOW_IN_TIME and statistic < TIME_MARGIN and ranking.slow_noise
+    if name not in ("outliers", "bias_step", "bias_periodic") and not is_noise(name):
+        # Only the number of forms and coefficients sets them apart, which is no evidence.
+        own |= dict.fromkeys(ranking.twins(name) & own.keys(), own[name])
     if runs < 2 and (hidden_by_walk or too_close):
         own["noise_random_walk"] = max(0.0, statistic - 1.0)
     top = max(own.values())
@@ -116,6 +119,8 @@ def judge(
                 continue
         if name in baseline.model.wholly_fixed():
             findings.append(f"{name} is fixed in the simulation at a value that the data contradict: it was set free.")
+        if name == "scale_factor":
+            findings.append("A scale error of the rate table would look the same: check it against a second reference.")
         close = _close_rival(step, members)
         findings += [close] if close else []
         turn = sum(f.name == name for f in found[i:])
@@ -131,8 +136,14 @@ def judge(
     driver, share = remaining(scanner, baseline, selection)
     unexplained = {" and ".join(smooth_columns(driver)): share} if driver else {}
     if driver and (not causes or share > UNKNOWN_SHARE):
-        column = smooth_columns(driver)
-        test = f"Vary {' and '.join(column)} alone, in steps up and down, everything else held, and repeat the run."
+        columns = smooth_columns(driver)
+        varied = dict.fromkeys(c.removesuffix("_rate").removesuffix("_lagged") for c in columns)
+        how = "in steps up and down"
+        if any(c.endswith("_rate") for c in columns):
+            how = "in ramps of several speeds up and down"
+        elif any(c.endswith("_lagged") for c in columns):
+            how = "in steps held until nothing changes any more"
+        test = f"Vary {' and '.join(varied)} alone, {how}, everything else held, and repeat the run."
         return Judgement("unknown", tuple(causes), {driver: 1.0}, driver, test, unexplained, tuple(findings))
     if not causes and selection.remains:
         return Judgement("unknown", (), {selection.remains: 1.0}, None, None, unexplained, tuple(findings))

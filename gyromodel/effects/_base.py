@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Literal, Self
 
@@ -66,7 +66,8 @@ class Effect(eqx.Module):
     `supersedes` lists effects that this one contains as a special case; `held` the fields that physics
     or the search fixes; `positive` says that the (only) coefficient cannot be negative; `scan` names a fast search over
     every epoch or frequency; `untested` says why a campaign leaves it no `candidates`; `remembers` that a sample's
-    contribution depends on its neighbours in time.
+    contribution depends on its neighbours in time; `reach` is the largest amplitude (internal units) of an effect that
+    continues others.
     """
 
     id: ClassVar[str]
@@ -80,6 +81,7 @@ class Effect(eqx.Module):
     scan: ClassVar[Literal["", "step", "line"]] = ""
     untested: ClassVar[str] = "its driver does not vary"
     remembers: ClassVar[bool] = False
+    reach: ClassVar[float] = np.inf
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -108,6 +110,19 @@ class Effect(eqx.Module):
     def candidates(cls, signals: Signals) -> list[Self]:
         """The forms the search tries, at zero amplitude: every variant, every grid point of nonlinear parameters."""
         return [cls().prepared(signals)]
+
+    @classmethod
+    def hidden(cls, signals: Signals) -> str:
+        """What part of a searched effect a campaign cannot show, and why; empty if none."""
+        return ""
+
+    @classmethod
+    def continuing(cls, effects: Sequence[Effect]) -> Self | None:
+        """The effect grown from those of a model, whose sum it is where its last nonlinear parameter is zero.
+
+        That parameter is then its amplitude. None where the model has nothing to grow from.
+        """
+        return None
 
     @classmethod
     def declared(cls) -> dict[str, Parameter]:
@@ -161,8 +176,12 @@ class Effect(eqx.Module):
 
 
 def lacking(needed: Iterable[str], signals: Signals) -> list[str]:
-    """Columns needed that the signals lack; temperature_<place> stands for any second thermometer."""
+    """Columns needed that the signals lack.
+
+    temperature_<place> stands for any second thermometer; several campaigns are a run each.
+    """
     groups = {SECOND_THERMOMETER: len(thermometers(signals)) > 1, ANY_ACCELERATION: bool(accelerations(signals))}
+    groups["run"] = "run" in signals or "campaign" in signals
     return [each for each in needed if not any(groups.get(n, n in signals) for n in each.split(" or "))]
 
 

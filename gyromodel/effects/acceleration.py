@@ -103,6 +103,12 @@ class BiasAccelerationSquared(Effect):
         return self if any(self.products) else type(self)(products=_all_products(signals) or _products(signals)[:1])
 
     @classmethod
+    def hidden(cls, signals: Signals) -> str:
+        """The sum of the squares at rest."""
+        at_rest = _trace_is_constant(signals)
+        return "equal parts of all squares are a bias at 1 g: needs a centrifuge or vibration" if at_rest else ""
+
+    @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
         """Every product that varies, every two of them, and all."""
         each = [p for p in _products(signals) if _varies(signals, p)]
@@ -121,13 +127,16 @@ def _varies(signals: Signals, product: str) -> bool:
     return bool(np.ptp(np.asarray(signals[a] * signals[b])) > 0)
 
 
+def _trace_is_constant(signals: Signals) -> bool:
+    trace = np.asarray(sum(signals[n] ** 2 for n in accelerations(signals)))
+    return bool(np.std(trace) < TRACE_VARIES * np.mean(trace))
+
+
 def _all_products(signals: Signals) -> tuple[str, ...]:
     """Products that vary, less the last square where the sum of the squares is a constant."""
-    names = accelerations(signals)
     kept = [p for p in _products(signals) if _varies(signals, p)]
-    trace = np.asarray(sum(signals[n] ** 2 for n in names)) if names else np.zeros(1)
     squares = [p for p in kept if len(set(p.split("*"))) == 1]
-    if len(squares) > 1 and np.std(trace) < TRACE_VARIES * np.mean(trace):
+    if len(squares) > 1 and _trace_is_constant(signals):
         kept.remove(squares[-1])
     return tuple(kept)
 

@@ -61,7 +61,7 @@ class Bandwidth(Effect):
     """I += y − ω with τ dy/dt + y = ω: the output follows the rate through a first-order lag.
 
     The search lets a share of the effect vary to have a linear coefficient, which for a small time constant is
-    −τ dω/dt; the fit holds it at one. Between samples the rate is a straight line.
+    −τ dω/dt; the fit holds it at one.
     """
 
     id = "bandwidth"
@@ -83,7 +83,7 @@ class Bandwidth(Effect):
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """y − ω."""
-        return stack(lagged(signals["time"], signals["rate"], self.time_constant) - signals["rate"])
+        return stack(lag(signals["time"], signals["rate"], self.time_constant))
 
     def settled(self) -> Self:
         """All of the output lags, by as much as has the same slope."""
@@ -148,14 +148,15 @@ def _clock(
     return rising, first, last
 
 
-def earlier(
-    time: Float[Array, " sample"], values: Float[Array, " sample"], delay: Float[Array, ""]
+def _cubic(
+    clock: Float[Array, " sample"],
+    first: Int[Array, " sample"],
+    last: Int[Array, " sample"],
+    values: Float[Array, " sample"],
+    wanted: Float[Array, " sample"],
 ) -> Float[Array, " sample"]:
-    """Values a delay before each sample, by the cubic through the four samples around; held at a stretch's ends."""
-    clock, first, last = _clock(time)
-    wanted = clock - delay
-    wanted = jnp.clip(wanted, clock[first], clock[last])
-    left = jnp.clip(jnp.searchsorted(clock, wanted, side="right") - 1, first, jnp.maximum(last - 1, first))
+    """The cubic through the four samples around each wanted time, of the row's own stretch."""
+    left = jnp.searchsorted(clock, wanted, side="right") - 1
     start = jnp.clip(left - 1, first, jnp.maximum(last - 3, first))
     rows = start[:, None] + jnp.arange(4)
     inside = rows <= last[:, None]
@@ -166,41 +167,44 @@ def earlier(
     for j in range(4):
         weight = inside[:, j].astype(float)
         for k in {0, 1, 2, 3} - {j}:
-            factor = (at - places[:, k]) / _apart(places[:, j] - places[:, k])
+            apart = places[:, j] - places[:, k]
+            factor = (at - places[:, k]) / jnp.where(apart == 0, 1.0, apart)
             weight = weight * jnp.where(inside[:, k], factor, 1.0)
         weights.append(weight)
     return jnp.sum(stack(*weights) * values[rows], axis=1)
 
 
-def _apart(difference: Array) -> Array:
-    return jnp.where(difference == 0, 1.0, difference)
+def earlier(
+    time: Float[Array, " sample"], values: Float[Array, " sample"], delay: Float[Array, ""]
+) -> Float[Array, " sample"]:
+    """Values a delay before each sample, by the cubic through the four samples around; held at a stretch's ends."""
+    clock, first, last = _clock(time)
+    return _cubic(clock, first, last, values, jnp.clip(clock - delay, clock[first], clock[last]))
 
 
-def lagged(
+def slope(time: Float[Array, " sample"], values: Float[Array, " sample"]) -> Float[Array, " sample"]:
+    """Derivative by time, of the cubic through the four samples around."""
+    clock, first, last = _clock(time)
+    return jax.jvp(lambda t: _cubic(clock, first, last, values, t), (clock,), (jnp.ones_like(clock),))[1]
+
+
+def lag(
     time: Float[Array, " sample"], values: Float[Array, " sample"], time_constant: Float[Array, ""]
 ) -> Float[Array, " sample"]:
-    """Output of a first-order lag for straight lines between the samples; it begins each stretch in step with them."""
+    """Output less input of a first-order lag, which begins each stretch steadily behind.
+
+    d = y − ω follows τ dd/dt + d = −τ dω/dt; between samples dω/dt is a straight line.
+    """
     clock, first, _ = _clock(time)
-    step = jnp.diff(clock, prepend=clock[0] - 1.0)
     begins = first == jnp.arange(len(time))
-    decay = jnp.where(begins, 0.0, jnp.exp(-step / time_constant))
-    ratio = time_constant / step
-    before = jnp.concatenate([values[:1], values[:-1]])
-    drive = (1.0 - ratio * (1.0 - decay)) * values + (ratio * (1.0 - decay) - decay) * before
-    drive = jnp.where(begins, values, drive)
+    step = jnp.diff(clock, prepend=clock[0] - 1.0)
+    steady = -time_constant * slope(time, values)
+    decay, ratio = jnp.exp(-step / time_constant), time_constant / step
+    mean = ratio * (1.0 - decay)
+    drive = (1.0 - mean) * steady + (mean - decay) * jnp.concatenate([steady[:1], steady[:-1]])
+    decay, drive = jnp.where(begins, 0.0, decay), jnp.where(begins, steady, drive)
 
     def both(a, b):
         return a[0] * b[0], b[0] * a[1] + b[1]
 
     return jax.lax.associative_scan(both, (decay, drive))[1]
-
-
-def slope(time: Float[Array, " sample"], values: Float[Array, " sample"]) -> Float[Array, " sample"]:
-    """Derivative by time: of the parabola through a sample and its neighbours, of a line at the ends of a stretch."""
-    clock, first, last = _clock(time)
-    rows = jnp.arange(len(time))
-    before, after = jnp.maximum(rows - 1, first), jnp.minimum(rows + 1, last)
-    back, ahead = clock - clock[before], clock[after] - clock
-    down, up = (values - values[before]) / _apart(back), (values[after] - values) / _apart(ahead)
-    inside = (down * ahead + up * back) / _apart(back + ahead)
-    return jnp.where(back == 0, up, jnp.where(ahead == 0, down, inside))

@@ -159,7 +159,8 @@ class TableHarmonic(Effect):
 class BiasMagnetic(Effect):
     """D += D_H H: bias proportional to a magnetic field, or, where none is measured, A cos Θ + B sin Θ.
 
-    Θ is the angle by which the gyro turns in a field that stands still, `angle` its column. With the field measured,
+    Θ is the angle by which the gyro turns in a field that stands still, `angle` its column: the azimuth, or the table
+    angle where there is none. With the field measured,
     `field` names the columns of its components; if both are empty, what the campaign has.
     """
 
@@ -207,7 +208,7 @@ class BiasMagnetic(Effect):
         names = _field(signals)
         if names:
             return type(self)(field=tuple(varying(signals, names) or names[:1]))
-        return type(self)(angle=angle_column(signals, "table_angle", "azimuth"))
+        return type(self)(angle=angle_column(signals, "azimuth", "table_angle"))
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:

@@ -162,6 +162,22 @@ class ScaleTemperature(Effect):
         return eqx.tree_at(lambda e: e.reference, self, round_reference(signals["temperature"]))
 
 
+class ScaleDrift(Effect):
+    """ε += R t: scale factor drifting in proportion to time."""
+
+    id = "scale_drift"
+    site = "scale"
+    needs = ("rate", "time")
+    cause = "Source wavelength, magnet or electronics gain age or settle."
+    test = "Repeat the run at another temperature: what follows temperature does not keep its slope over time."
+
+    slope: Float[Array, ""] = parameter("ppm/h", 10.0, "relative change per unit of time")
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """Time since the start."""
+        return stack(signals["time"])
+
+
 class ScaleTemperatureCurve(Effect):
     """ε += Σ a_i ((T − T0)/10 °C)^i + Σ h_j max(T − T_j, 0): scale factor curved over temperature."""
 

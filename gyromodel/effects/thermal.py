@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Sequence
 from typing import Self
 
 import equinox as eqx
@@ -13,7 +14,7 @@ from jaxtyping import Array, Float
 
 from gyromodel._checks import thermometers
 from gyromodel.effects._base import Effect, Signals, parameter, round_reference, setting, stack
-from gyromodel.effects._shapes import check_curve, curve_columns, curve_forms
+from gyromodel.effects._shapes import POWER_SCALE, check_curve, curve_columns, curve_forms
 
 
 class BiasTemperature(Effect):
@@ -88,6 +89,88 @@ class BiasTemperatureRate(Effect):
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """dT/dt of the smoothed thermometer."""
         return stack(signals["temperature_rate"])
+
+
+class BiasTemperatureProduct(Effect):
+    """E += D (T − T0) dT/dt: a Shupe effect that changes with temperature."""
+
+    id = "bias_temperature_product"
+    site = "rate"
+    needs = ("temperature",)
+    cause = (
+        "The fiber's thermal coefficients change with temperature, and its response to a temperature front with them."
+    )
+    test = "The same ramp at a low and at a high temperature: the Shupe effect is the same in both, this is not."
+
+    coefficient: Float[Array, ""] = parameter("deg/h/(degC^2/s)", 30.0, "change of the Shupe coefficient per degree")
+    reference: Float[Array, ""] = setting()
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """(T − T0) dT/dt of the smoothed thermometer."""
+        return stack((signals["temperature"] - self.reference) * signals["temperature_rate"])
+
+    def prepared(self, signals: Signals) -> Self:
+        """Refer to the campaign's mean temperature."""
+        if np.isfinite(float(self.reference)):
+            return self
+        return eqx.tree_at(lambda e: e.reference, self, round_reference(signals["temperature"]))
+
+
+class TemperatureLag(Effect):
+    """E += b(T + τ dT/dt), b(u) = Σ a_i ((u − T0)/10 °C)^i + Σ h_j max(u − T_j, 0): the thermometer is late by τ.
+
+    It contains the bias over temperature, b, and equals it for τ = 0. Where b is a line of slope a it is
+    bias_temperature_rate with the coefficient a·τ. Below zero τ says that the coil is later than the thermometer.
+    """
+
+    id = "temperature_lag"
+    site = "rate"
+    needs = ("temperature",)
+    cause = "The thermometer follows the part that makes the bias with a delay, or that part follows the thermometer."
+    test = "Ramp through temperatures where the bias rises and where it falls: this error changes sign between them."
+    supersedes = ("bias_temperature", "bias_temperature_curve")
+    untested = "the simulation has no bias over temperature that could come late"
+    reach = 900.0
+
+    coefficients: Float[Array, " order"] = parameter("deg/h", 1.0, "power i: bias per (10 °C)^i", default=(0.0,))
+    hinges: Float[Array, " hinge"] = parameter("deg/h/degC", 1.0, "change of slope at each breakpoint", default=())
+    breakpoints: Float[Array, " hinge"] = parameter("degC", 10.0, "where the slope changes", linear=False, default=())
+    time_constant: Float[Array, ""] = parameter("s", 100.0, "how late the thermometer is", linear=False)
+    reference: Float[Array, ""] = setting()
+
+    def __check_init__(self) -> None:
+        check_curve(self.coefficients, self.hinges, self.breakpoints)
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """Those of the curve, at the temperature that the thermometer will show."""
+        ahead = signals["temperature"] + self.time_constant * signals["temperature_rate"]
+        return curve_columns(ahead, self.reference, self.coefficients.shape[0], self.breakpoints)
+
+    def prepared(self, signals: Signals) -> Self:
+        """Refer to the campaign's mean temperature."""
+        if np.isfinite(float(self.reference)):
+            return self
+        return eqx.tree_at(lambda e: e.reference, self, round_reference(signals["temperature"]))
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """None: it continues the bias over temperature that a model has."""
+        return []
+
+    @classmethod
+    def continuing(cls, effects: Sequence[Effect]) -> Self | None:
+        """The model's own bias over temperature, not late yet."""
+        for effect in effects:
+            if isinstance(effect, BiasTemperature):
+                return cls(coefficients=effect.coefficient[None] * POWER_SCALE, reference=effect.reference)
+            if isinstance(effect, BiasTemperatureCurve):
+                return cls(
+                    coefficients=effect.coefficients,
+                    hinges=effect.hinges,
+                    breakpoints=effect.breakpoints,
+                    reference=effect.reference,
+                )
+        return None
 
 
 class _BetweenThermometers(Effect):

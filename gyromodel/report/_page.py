@@ -87,7 +87,9 @@ def context(diagnosis: Diagnosis) -> dict[str, Any]:
         "rankings": _rankings(diagnosis),
         "ladder": _ladder(diagnosis),
         "gain": _gain(diagnosis),
+        "nearest": _nearest(diagnosis),
         "noise": _noise(diagnosis.noise),
+        "noise_kinds": _noise_kinds(diagnosis),
         "credible": [
             {
                 "title": title(name, kind.get(name, "effect")),
@@ -255,6 +257,29 @@ def _noise(noise: Mapping[str, Mapping[str, float | str]]) -> list[dict[str, str
     return rows
 
 
+def _nearest(diagnosis: Diagnosis) -> str:
+    """What in the catalogue comes closest to the curve that was found, and why it is not that."""
+    driver = diagnosis.driver
+    if driver is None or not driver.nearest:
+        return ""
+    return (
+        f"Of the catalogue, {phrase(driver.nearest)} comes closest: alone it explains "
+        f"{100 * driver.nearest_share:.0f} % of what the curve explains, and the evidence for the curve is "
+        f"{number(driver.behind, 2)} nats greater."
+    )
+
+
+def _noise_kinds(diagnosis: Diagnosis) -> str:
+    """What the noise is most probably made of."""
+    kinds = list(diagnosis.noise_kinds.items())
+    if not kinds:
+        return ""
+    name, share = kinds[0]
+    made = listed([title(part).lower() for part in name.split(" + ")])
+    second = f"; {listed([title(p).lower() for p in kinds[1][0].split(' + ')])} with {100 * kinds[1][1]:.0f} %"
+    return f"Most probably {made} ({100 * share:.0f} %{second if len(kinds) > 1 and kinds[1][1] >= 0.05 else ''})."
+
+
 def _searched(diagnosis: Diagnosis) -> list[dict[str, str]]:
     """Each searched effect with the smallest size that would have been seen."""
     named = {cause.effect for cause in diagnosis.causes}
@@ -293,7 +318,8 @@ def _threshold(diagnosis: Diagnosis) -> str:
     if diagnosis.threshold_kind == "calibrated":
         return (
             f"An effect is accepted when its evidence exceeds {bound}. This bound was calibrated: it is what the best "
-            "of all candidates reaches in one of 100 simulations of this campaign with its noise and nothing missing."
+            "of all candidates reaches in one of 100 simulations of this campaign with its noise and nothing missing. "
+            f"As much evidence as here is reached in {100 * (diagnosis.p_value or 0.0):.2g} % of them."
         )
     return (
         f"An effect is accepted when its evidence exceeds {bound}, odds of {_odds(diagnosis.threshold)} after paying "

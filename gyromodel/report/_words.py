@@ -13,6 +13,7 @@ PHRASES = {
     "scale_nonlinearity": "a scale-factor nonlinearity over rate",
     "scale_spline": "a smooth scale-factor curve over rate",
     "scale_sagnac_sine": "a sine-shaped response to rate (open-loop Sagnac phase)",
+    "scale_drift": "a scale-factor drift in time",
     "scale_temperature": "a scale factor that changes with temperature",
     "scale_temperature_curve": "a scale factor that curves with temperature",
     "lock_in": "lock-in: a dead band around rest",
@@ -21,8 +22,13 @@ PHRASES = {
     "bias_temperature": "a bias proportional to temperature",
     "bias_temperature_curve": "a bias that curves with temperature",
     "bias_temperature_rate": "a temperature-rate bias",
+    "bias_temperature_product": "a temperature-rate bias that changes with temperature",
+    "temperature_lag": "a thermometer that is late",
+    "bias_thermal_hysteresis": "a thermal hysteresis of the bias",
     "bias_temperature_gradient": "a bias proportional to a temperature difference",
     "bias_temperature_gradient_rate": "a bias proportional to the rate of a temperature difference",
+    "rate_hysteresis": "a hysteresis over rate",
+    "bias_turn_on": "a bias that differs from turn-on to turn-on",
     "bias_warmup": "a warm-up bias",
     "bias_drift": "a bias drift in time",
     "bias_step": "a step of the bias",
@@ -58,7 +64,13 @@ def spoken(name: str) -> str:
 def driver_name(text: str) -> str:
     """The columns of a driver in words, from its label such as "smooth(rate, temperature)"."""
     columns = text.removeprefix("smooth(").removesuffix(")") if text.startswith("smooth(") else text
-    return listed([_DRIVERS.get(column.strip(), spoken(column)) for column in columns.split(",")])
+    return listed([_driven(column.strip()) for column in columns.split(",")])
+
+
+def _driven(column: str) -> str:
+    if column.endswith("_lagged"):
+        return f"{spoken(column.removesuffix('_lagged'))} some time before"
+    return _DRIVERS.get(column, spoken(column))
 
 
 def phrase(effect: str, kind: str = "effect") -> str:

@@ -9,22 +9,24 @@ import numpy as np
 
 from .designs import Design
 from .effects import EFFECTS, UNKNOWN, draw_shape, error
-from .mde import amplitude, baseline
+from .mde import amplitude, baseline, parts
 from .motion import LAGS
 from .noise import Noise
 
 Array = np.ndarray
 
-A, B, C = "rate_temperature", "static_cycle", "rate_steps"
+A, B, C, RUNS = "rate_temperature", "static_cycle", "rate_steps", "repeated_runs"
 _TIME = ("bias_drift", "bias_step", "bias_warmup", "bias_periodic")
 _SCALE = ("scale_factor", "scale_asymmetry", "scale_nonlinearity", "scale_sagnac_sine")
 _THERMAL = ("bias_temperature", "bias_temperature_curve")
 _FORCE = ("bias_acceleration_input", "bias_acceleration_spin", "bias_acceleration_output", "bias_acceleration_squared")
 TESTABLE: dict[str, tuple[str, ...]] = {  # catalogue effects that each design can show
-    A: (*_SCALE, "scale_temperature", "scale_temperature_curve", "bias", *_THERMAL, *_TIME, "bias_supply_voltage"),
+    A: (*_SCALE, "scale_temperature", "scale_temperature_curve", "bias", *_THERMAL, *_TIME, "bias_supply_voltage",
+        "scale_drift", "rate_hysteresis"),
     B: ("bias", *_THERMAL, "bias_temperature_rate", *_TIME, "bias_supply_voltage", "bias_pressure",
-        "bias_laser_current"),
-    C: (*_SCALE, "scale_temperature", "bias", "bias_temperature", *_TIME),
+        "bias_laser_current", "bias_temperature_product", "bias_thermal_hysteresis"),
+    C: (*_SCALE, "scale_temperature", "bias", "bias_temperature", *_TIME, "rate_hysteresis"),
+    RUNS: ("bias_turn_on",),
     "static_ramp": ("bias_temperature", "bias_drift"),
     "tumble": (*_FORCE, "misalignment", "scale_factor", "bias_temperature"),
     "turntable": ("table_tilt", "bias_magnetic", "table_harmonic", "scale_factor", "scale_asymmetry",
@@ -37,14 +39,24 @@ TESTABLE: dict[str, tuple[str, ...]] = {  # catalogue effects that each design c
 MOTION = ("tumble", "turntable", "dynamic_rates")
 UNCATALOGUED: dict[str, tuple[str, ...]] = {
     A: ("temperature_ripple", "rate_ripple", "supply_voltage_ripple", "rate_temperature_bump"),
-    B: ("temperature_ripple", "supply_voltage_ripple", "pressure_bump", "pressure_switch"),
+    B: (
+        "temperature_ripple",
+        "supply_voltage_ripple",
+        "pressure_bump",
+        "pressure_switch",
+        "temperature_rate_switch",
+        "buried_temperature_ripple",
+    ),
     C: ("rate_ripple",),
 }
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What was hidden; `effect` None for nothing, `driver` the columns an uncatalogued effect follows."""
+    """What was hidden: `effect` None for nothing, two joined by "+"; `driver` the columns an unknown effect follows.
+
+    `amplitude` and `shape` are those of the first effect.
+    """
 
     effect: str | None
     amplitude: float = 0.0
@@ -54,6 +66,7 @@ class Truth:
     bias: float = 0.0
     scale_error: float = 0.0
     error: Array = field(default_factory=lambda: np.zeros(0))
+    errors: tuple[Array, ...] = ()  # of each effect
     noise: Array = field(default_factory=lambda: np.zeros(0))
 
 
@@ -67,21 +80,22 @@ def hide(
     names = baseline(design, effect)
     bias = np.deg2rad(rng.uniform(-20, 20) / 3600) if "bias" in names else 0.0
     scale_error = rng.uniform(-1e-3, 1e-3) if "scale_factor" in names else 0.0
-    shape, size, wrong = {}, 0.0, np.zeros(len(design.index))
-    if effect is not None:
-        shape = draw_shape(effect, design, rng)
-        size = float(rng.choice([-1, 1])) * amplitude(effect, design, noise, shape, times_mde)
-        if effect in ("scale_sagnac_sine", *LAGS):
+    size, shape, errors = 0.0, {}, []
+    for part in parts(effect)[::-1]:
+        shape = draw_shape(part, design, rng)
+        size = float(rng.choice([-1, 1])) * amplitude(part, design, noise, shape, times_mde)
+        if part in ("scale_sagnac_sine", *LAGS):
             size = abs(size)  # a phase has no second sign, nor has a lag
-        wrong = error(effect, design, size, shape)
+        errors.insert(0, error(part, design, size, shape))
+    wrong = sum(errors, np.zeros(len(design.index)))
     drawn = noise.sample(design, rng)
     output = design.true["rate"] * (1 + scale_error) + (wrong + bias) * (1 + scale_error) + drawn
     columns = design.columns | {"output": np.rad2deg(output)}
     driver = UNKNOWN[effect][1] if effect in UNKNOWN else None
-    truth = Truth(effect, size, shape, driver, names, bias, scale_error, wrong, drawn)
+    truth = Truth(effect, size, shape, driver, names, bias, scale_error, wrong, tuple(errors), drawn)
     return columns, design.units | {"output": "deg/s"}, dict(design.metadata), truth
 
 
 def known(effect: str | None) -> bool:
-    """Whether the catalogue has this effect."""
-    return effect in EFFECTS
+    """Whether something was hidden, and all of it is in the catalogue."""
+    return effect is not None and all(part in EFFECTS for part in parts(effect))

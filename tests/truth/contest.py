@@ -6,9 +6,11 @@ A library maps each name to an array (sample, shape, column): every shape is one
 from __future__ import annotations
 
 from typing import NamedTuple
+from warnings import catch_warnings
 
 import numpy as np
 from scipy.special import gammaln, ive, logsumexp
+from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
 from .campaigns import TESTABLE
@@ -43,7 +45,13 @@ def _signals(name: str, design: Design) -> Array:
         case "bias_temperature_curve" | "scale_temperature_curve":
             knots = np.percentile(design.true["temperature"], np.linspace(20, 80, 12))
             shapes = [{"kind": kind, "at": at} for kind in ("parabola", "bend") for at in knots]
-        case "bias_temperature_rate":
+        case "bias_thermal_hysteresis" | "rate_hysteresis":
+            driver = design.true["rate" if name == "rate_hysteresis" else "temperature"]
+            shapes = [{"half_width": part * np.ptp(driver)} for part in np.geomspace(0.03, 0.25, 10)]
+        case "bias_turn_on":
+            runs = np.eye(len(np.unique(design.true["run"])))[1:]
+            return np.stack([error(name, design, 1.0, {"offsets": row}) for row in runs], axis=-1)[:, None]
+        case "bias_temperature_rate" | "bias_temperature_product":
             shapes = [{"tau": 2.5 * design.step}]
         case "bias_warmup":
             shapes = [{"tau": tau * span} for tau in np.geomspace(0.04, 0.3, 12)]
@@ -129,42 +137,52 @@ def stepwise_bic(unit: Library, residual: Array, most: int = 4) -> Control:
     return Control(tuple(dict.fromkeys(added)), first)
 
 
+def hac_f(unit: Library, residual: Array, lags: int = 6) -> Control:
+    """Wald test with the covariance of Newey and West, Bonferroni over every candidate and shape, 1 %."""
+    tests, p = sum(u.shape[1] for u in unit.values()), {}
+    for name, u in unit.items():
+        b = np.einsum("nmq,n->mq", u, residual)
+        score = u * (residual[:, None] - np.einsum("nmq,mq->nm", u, b))[:, :, None]
+        V = np.einsum("nmi,nmj->mij", score, score)
+        for lag in range(1, lags + 1):
+            G = np.einsum("nmi,nmj->mij", score[lag:], score[:-lag])
+            V += (1 - lag / (lags + 1)) * (G + G.transpose(0, 2, 1))
+        wald = np.einsum("mi,mi->m", b, np.linalg.solve(V, b[:, :, None])[:, :, 0])
+        p[name] = chi2.logsf(wald.max(), u.shape[2])
+    first = min(p, key=p.__getitem__)
+    return Control((first,) if p[first] < np.log(0.01 / tests) else (), first)
+
+
 def lasso(unit: Library, residual: Array, most_columns: int = 60) -> Control:
-    """Lasso on the columns that correlate best; penalty by five-fold cross-validation, one-standard-error rule."""
+    """Lasso on the columns that correlate best; penalty by five-fold cross-validation."""
+    from sklearn.linear_model import LassoCV
+    from sklearn.model_selection import KFold
+
     X, owner = [], []
     for name, u in unit.items():
-        best = np.argsort(-energies({name: u}, residual)[name])[:8]
-        for m in best:
+        for m in np.argsort(-energies({name: u}, residual)[name])[:8]:
             X += list(u[:, m].T)
             owner += [name] * u.shape[2]
     keep = np.argsort(-np.abs(np.array(X) @ residual))[:most_columns]
-    columns, owner = np.array(X)[keep].T, [owner[k] for k in keep]
-    path = np.abs(columns.T @ residual).max() * np.geomspace(1, 0.02, 25)
-    fold = np.arange(len(residual)) * 5 // len(residual)
-    loss = np.empty((5, len(path)))
-    for k in range(5):
-        train, test = fold != k, fold == k
-        for j, b in enumerate(_lasso_path(columns[train], residual[train], 0.8 * path)):
-            loss[k, j] = np.mean((residual[test] - columns[test] @ b) ** 2)
-    mean, error = loss.mean(0), loss.std(0, ddof=1) / np.sqrt(5)
-    chosen = int(np.argmax(mean <= mean.min() + error[mean.argmin()]))
-    *_, b = _lasso_path(columns, residual, path[: chosen + 1])
+    scale = np.sqrt(len(residual))  # columns of unit variance, as the penalty wants them
+    columns, owner = scale * np.array(X)[keep].T, [owner[k] for k in keep]
+    with catch_warnings(action="ignore"):
+        b = LassoCV(cv=KFold(5), fit_intercept=False).fit(columns, residual / residual.std()).coef_
     order = np.argsort(-np.abs(b))
     added = tuple(dict.fromkeys(owner[i] for i in order if b[i] != 0))
     return Control(added, added[0] if added else owner[0])
 
 
-def _lasso_path(X: Array, y: Array, penalties: Array) -> list[Array]:
-    """Accelerated proximal gradient, warm-started down the path."""
-    G, c = X.T @ X, X.T @ y
-    step = 1 / np.linalg.eigvalsh(G)[-1]
-    b, path = np.zeros(len(c)), []
-    for penalty in penalties:
-        ahead, t = b, 1.0
-        for _ in range(80):
-            z = ahead + step * (c - G @ ahead)
-            new = np.sign(z) * np.maximum(np.abs(z) - step * penalty, 0.0)
-            t_new = 0.5 * (1 + np.sqrt(1 + 4 * t * t))
-            b, ahead, t = new, new + (t - 1) / t_new * (new - b), t_new
-        path.append(b)
-    return path
+def boosted_trees(design: Design, residual: Array) -> Control:
+    """Gradient-boosted trees on the measured columns: the one that matters most, if left-out fifths are predicted."""
+    from sklearn.ensemble import HistGradientBoostingRegressor
+    from sklearn.inspection import permutation_importance
+    from sklearn.model_selection import KFold, cross_val_predict
+
+    names = [n for n in design.columns if np.ptp(design.columns[n]) > 0]
+    X = np.column_stack([design.columns[n] for n in names])
+    trees = HistGradientBoostingRegressor(max_iter=60, random_state=0)
+    left = residual - cross_val_predict(trees, X, residual, cv=KFold(5))
+    importance = permutation_importance(trees.fit(X, residual), X, residual, n_repeats=3, random_state=0)
+    first = f"smooth({names[int(np.argmax(importance.importances_mean))]})"
+    return Control((first,) if left @ left < residual @ residual else (), first)

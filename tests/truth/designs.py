@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 Array = np.ndarray
 FINE = 2.0  # s, step of the thermal history
 THERMOMETER = 2e-3  # degC
+RAMP_CODES = 4096  # of a closed loop's ramp converter
 
 
 @dataclass(frozen=True)
@@ -151,6 +152,41 @@ def static_ramp(rng: np.random.Generator) -> Design:
     return _build("static_ramp", np.arange(n), step, np.zeros(n), thermal, {}, {"test": "static_ramp"}, rng)
 
 
+def one_speed_cycle(rng: np.random.Generator) -> Design:
+    """E: at rest, temperature up and down at one speed without soaks: lag, Shupe and hysteresis hardly differ."""
+    step, n = 20.0, 900
+    low, rise, tau = rng.uniform(0, 15), rng.uniform(30, 45), rng.uniform(200, 300)
+    legs = np.linspace(0.0, n * step, 5)
+    thermal = _thermal(legs, low + rise * np.array([0.0, 1.0, 0.0, 1.0, 0.0]), tau, 0.0, rng)
+    return _build("one_speed_cycle", np.arange(n), step, np.zeros(n), thermal, {}, {"test": "static_thermal"}, rng)
+
+
+def repeated_runs(rng: np.random.Generator) -> Design:
+    """F: six power cycles at rest, off between them, in a room whose temperature wanders."""
+    step, runs, rows = 20.0, 6, 150
+    off = rng.integers(40, 90, runs)
+    index = np.concatenate([k * rows + off[:k].sum() + np.arange(rows) for k in range(runs)])
+    fine = np.arange(0.0, (index[-1] + 2) * step, FINE)
+    thermal = fine, rng.uniform(20, 25) + _wander(fine, 1.5, 4000.0, rng)
+    extra = {
+        "run": (np.repeat(np.arange(1.0, runs + 1), rows), 0.0, ""),
+        "supply_voltage": (5.0 + _wander(index * step, 0.03, 900.0, rng), 2e-4, "V"),
+    }
+    return _build("repeated_runs", index, step, np.zeros(len(index)), thermal, extra, {"test": "static"}, rng)
+
+
+def closed_loop(rng: np.random.Generator) -> Design:
+    """G: at rest, the feedback ramp of a closed loop logged beside the output."""
+    step, n = 0.05, 1000
+    time = np.arange(n) * step
+    turns = np.cumsum(rng.uniform(0.019, 0.023) * (1 + 0.01 * rng.standard_normal(n)))
+    extra = {"feedback_ramp": (np.floor(RAMP_CODES * (turns % 1.0)), 0.0, "count")}
+    thermal = np.arange(0.0, time[-1] + 2 * FINE, FINE), np.full(len(np.arange(0.0, time[-1] + 2 * FINE, FINE)), 25.0)
+    return _build("closed_loop", np.arange(n), step, np.zeros(n), thermal, extra, {"test": "static"}, rng)
+
+
 DESIGNS: dict[str, Callable[[np.random.Generator], Design]] = {
-    f.__name__: f for f in (rate_temperature, static_cycle, rate_steps, static_ramp)
-}
+    f.__name__: f for f in (
+        rate_temperature, static_cycle, rate_steps, static_ramp, one_speed_cycle, repeated_runs, closed_loop,
+    )
+}  # fmt: skip

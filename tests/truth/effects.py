@@ -12,6 +12,15 @@ from typing import Any
 import numpy as np
 
 from .designs import Design
+from .memory import (
+    bias_readout_code,
+    bias_thermal_hysteresis,
+    bias_turn_on,
+    draw_hysteresis,
+    draw_table,
+    rate_hysteresis,
+    scale_drift,
+)
 from .motion import MOTION_EFFECTS, MOTION_SHAPES
 
 Array = np.ndarray
@@ -108,6 +117,12 @@ def bias_temperature_rate(design: Design, amplitude: float, tau: float) -> Array
     return amplitude * np.interp(design.true["time"], time, coil_temperature_rate(time, surface, tau))
 
 
+def bias_temperature_product(design: Design, amplitude: float, tau: float) -> Array:
+    """Shupe whose coefficient changes with temperature and is zero in the middle."""
+    temperature = design.true["temperature"]
+    return bias_temperature_rate(design, amplitude, tau) * (temperature - temperature.mean())
+
+
 # Bias by time.
 def bias(design: Design, amplitude: float) -> Array:
     """Constant bias."""
@@ -176,12 +191,26 @@ def rate_temperature_bump(design: Design, amplitude: float, at: tuple[float, flo
     return amplitude * np.exp(-0.5 * (((u - at[0]) / width) ** 2 + ((v - at[1]) / width) ** 2))
 
 
+def temperature_rate_switch(design: Design, amplitude: float, width: float) -> Array:
+    """Bias that saturates with the temperature's rate: joints that slip as soon as it moves."""
+    rate = design.true["temperature_rate"]
+    return amplitude * np.tanh(rate / (width * np.abs(rate).max()))
+
+
+def buried_temperature_ripple(design: Design, amplitude: float, cycles: float, phase: float, lag: float) -> Array:
+    """Bias rippling with the temperature of a place that follows the thermometer some time later."""
+    time, surface = design.thermal
+    before = np.interp(design.true["time"] - lag * np.ptp(time), time, surface)
+    return amplitude * np.sin(2 * np.pi * cycles * (before - before.min()) / np.ptp(before) + phase)
+
+
 EFFECTS: dict[str, Effect] = {
     f.__name__: f
     for f in (
         scale_factor, scale_asymmetry, scale_nonlinearity, scale_temperature, scale_temperature_curve,
         scale_sagnac_sine, bias, bias_temperature, bias_temperature_curve, bias_temperature_rate,
-        bias_drift, bias_step, bias_warmup, bias_periodic,
+        bias_drift, bias_step, bias_warmup, bias_periodic, bias_temperature_product, bias_thermal_hysteresis,
+        rate_hysteresis, bias_turn_on, scale_drift, bias_readout_code,
     )
 } | {f"bias_{c}": _linear(c) for c in ("supply_voltage", "pressure", "laser_current")} | MOTION_EFFECTS  # fmt: skip
 
@@ -190,6 +219,8 @@ UNKNOWN: dict[str, tuple[Effect, tuple[str, ...]]] = {  # effect and the columns
     "pressure_bump": (pressure_bump, ("pressure",)),
     "pressure_switch": (pressure_switch, ("pressure",)),
     "rate_temperature_bump": (rate_temperature_bump, ("rate", "temperature")),
+    "temperature_rate_switch": (temperature_rate_switch, ("temperature_rate",)),
+    "buried_temperature_ripple": (buried_temperature_ripple, ("temperature_lagged",)),
 }
 
 SCANS = ("bias_step", "bias_periodic", *UNKNOWN)  # effects that are searched for over many positions
@@ -220,12 +251,23 @@ SHAPES: dict[str, Callable[[Design, np.random.Generator], dict[str, Any]]] = {
     "scale_temperature_curve": _draw_curve,
     "bias_temperature_curve": _draw_curve,
     "bias_temperature_rate": lambda design, rng: {"tau": rng.uniform(1.0, 4.0) * design.step},
+    "bias_temperature_product": lambda design, rng: {"tau": rng.uniform(1.0, 4.0) * design.step},
+    "bias_thermal_hysteresis": lambda design, rng: draw_hysteresis(design.true["temperature"], rng),
+    "rate_hysteresis": lambda design, rng: draw_hysteresis(design.true["rate"], rng),
+    "bias_turn_on": lambda design, rng: {"offsets": rng.standard_normal(len(np.unique(design.true["run"])))},
+    "bias_readout_code": lambda design, rng: draw_table(rng),
     "bias_step": lambda design, rng: {"at": rng.uniform(*np.quantile(design.true["time"], [0.1, 0.9]))},
     "bias_warmup": lambda design, rng: {"tau": rng.uniform(0.05, 0.25) * design.true["time"][-1]},
     "bias_periodic": _draw_line,
     "temperature_ripple": _draw_ripple,
     "rate_ripple": _draw_ripple,
     "supply_voltage_ripple": _draw_ripple,
+    "temperature_rate_switch": lambda design, rng: {"width": rng.uniform(0.05, 0.15)},
+    "buried_temperature_ripple": lambda design, rng: {
+        "cycles": rng.uniform(2.0, 3.0),
+        "phase": rng.uniform(0, 2 * np.pi),
+        "lag": rng.uniform(0.02, 0.06),
+    },
     "pressure_bump": lambda design, rng: {"at": rng.uniform(0.3, 0.7), "width": rng.uniform(0.06, 0.12)},
     "pressure_switch": lambda design, rng: {"at": rng.uniform(0.2, 0.4), "width": rng.uniform(0.02, 0.05)},
     "rate_temperature_bump": lambda design, rng: {

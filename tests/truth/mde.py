@@ -22,10 +22,15 @@ Array = np.ndarray
 REGULAR, SCAN = 4.3, 5.5
 
 
+def parts(effect: str | None) -> tuple[str, ...]:
+    """The effects that are hidden together: "a+b"."""
+    return tuple(effect.split("+")) if effect else ()
+
+
 def baseline(design: Design, effect: str | None = None) -> tuple[str, ...]:
     """Names in the model that the engine starts from: scale and bias, less what is hidden."""
     names = ("scale_factor", "bias") if design.rotates else ("bias",)
-    return tuple(n for n in names if n != effect)
+    return tuple(n for n in names if n not in parts(effect))
 
 
 def simpler(effect: str | None) -> tuple[str, ...]:

@@ -6,25 +6,29 @@ import os
 import time
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
-from itertools import cycle
+from dataclasses import dataclass, replace
+from itertools import combinations, cycle
 from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
-from scipy.stats import beta, binom
+from scipy.stats import norm
 
 from . import contest
-from .campaigns import MOTION, TESTABLE, UNCATALOGUED, A, B, C, Truth, hide, known
+from .campaigns import MOTION, RUNS, TESTABLE, UNCATALOGUED, A, B, C, Truth, hide, known
 from .designs import DESIGNS, Design
-from .mde import oracle
+from .effects import error
+from .mde import Oracle, baseline, oracle, parts
 from .motion import MOTION_EFFECTS
 from .motion_designs import MOTION_DESIGNS
-from .noise import FAMILY, OUTSIDE, Noise, draw
+from .mutants import mutated
+from .noise import FAMILY, Noise, draw
 from .verdicts import Answer, Score, judge
 
 Array = np.ndarray
-CONTROLS = ("least_squares_f", "stepwise_bic", "lasso")
+# The rival of these is the noise itself: they are judged with the ambiguous.
+SLOW = ("bias_drift", "bias_step", "bias_warmup")
+CONTROLS = ("least_squares_f", "hac_f", "stepwise_bic", "lasso", "boosted_trees")
 
 
 @dataclass(frozen=True)
@@ -76,22 +80,48 @@ def build(case: Case) -> Built:
     return Built(*hide(case.effect, design, noise, case.times_mde, rng), design, noise)
 
 
-def run_engine(built: Built, gain: bool = False) -> Answer:
-    """The only place that calls the package."""
+def run_engine(
+    built: Built, *, gain: bool = False, calibrate: int = 0, after: bool = False, mutant: str = ""
+) -> Answer:
+    """The only place that calls the package.
+
+    Args:
+        built: the campaign.
+        gain: whether to measure the held-out gain.
+        calibrate: draws with nothing hidden.
+        after: whether to diagnose the extended model too, and to carry out the further test that is asked for.
+        mutant: what to switch off in the engine.
+    """
     import gyromodel
+    from gyromodel.units import factor, internal_unit
 
     campaign = gyromodel.Campaign(columns=built.columns, units=built.units, metadata=built.metadata)
     model = gyromodel.model_from_effects(list(built.truth.baseline))
     start = time.perf_counter()
-    # The held-out gain repeats the search without each block: only nulls, where nothing is found, have it always.
-    found = gyromodel.diagnose(campaign, model, hold_out=gain or built.truth.effect is None)
+    with mutated(mutant):
+        found = gyromodel.diagnose(campaign, model, hold_out=gain, calibrate=calibrate)
     seconds = time.perf_counter() - start
+    sizes = {}
+    for cause in (c for c in found.causes if c.parameters):
+        size = cause.parameters[0]
+        scale = factor(size.unit, internal_unit(size.unit))
+        sizes[cause.effect] = (size.value * scale, size.std * scale)
+    adequate = None
+    if after and found.verdict == "named":
+        again = gyromodel.diagnose(campaign, found.extended.model_as_given(), hold_out=False)
+        adequate = again.verdict == "adequate"
     driver = tuple(found.driver.column.split(" and ")) if found.driver else ()
     gain = found.gain
     return Answer(
         verdict=found.verdict,
         causes=tuple(c.effect for c in found.causes),
         first=next((c.effect for c in found.rounds[0].ranking if c.kind == "effect"), "") if found.rounds else "",
+        evidence={c.effect: c.statistic for c in found.rounds[0].ranking if c.kind == "effect"},
+        sizes=sizes,
+        noise=next(iter(found.noise_kinds), ""),
+        p_value=found.p_value,
+        adequate_after=adequate,
+        settled=_settled(built, campaign, model, found.next_test) if after and found.verdict == "ambiguous" else None,
         credible=tuple(found.credible_set),
         driver=driver,
         gain_ratio=(gain.ratio, *gain.ci95) if gain else (1.0, 1.0, 1.0),
@@ -100,36 +130,71 @@ def run_engine(built: Built, gain: bool = False) -> Answer:
     )
 
 
-def run_case(
-    case: Case, engine: bool = True, oracle_too: bool = True, controls: bool = False, gain: bool = False
-) -> Record:
-    """Simulate, diagnose and judge one case; `gain` measures the held-out gain of an effect in white noise too."""
+def _settled(built: Built, campaign: Any, model: Any, asked: str | None) -> tuple[str, ...] | None:
+    """The credible set once the further test has been carried out too, by the simulator; None where none is known."""
+    import gyromodel
+    from gyromodel.diagnosis._added_tests import added_tests
+
+    test = next((t for t in added_tests(campaign) if (asked or "").startswith(t.sentence)), None)
+    if test is None:
+        return None
+    temperature = test.campaign.columns["temperature"]
+    rate = np.gradient(temperature, built.design.true["time"])
+    lived = replace(built.design, true=built.design.true | {"temperature": temperature, "temperature_rate": rate})
+    rng = np.random.default_rng(len(campaign))
+    wrong = error(str(built.truth.effect), lived, built.truth.amplitude, built.truth.shape)
+    output = wrong + built.truth.bias + built.noise.sample(lived, rng)
+    second = test.campaign.with_column("output", np.rad2deg(output), "deg/s")
+    return tuple(gyromodel.diagnose([campaign, second], model, hold_out=False).credible_set)
+
+
+def run_case(case: Case, *, engine: bool = True, controls: bool = False, **options: Any) -> Record:
+    """Simulate, diagnose and judge one case; `options` are those of `run_engine`."""
     built = build(case)
     truth, design = built.truth, built.design
     size, isolable, first, others = 0.0, False, "", {}
-    if controls or (oracle_too and known(case.effect)):
-        signals = contest.library(design, case.effect)
-        data = built.columns["output"] * np.pi / 180 - design.true["rate"]
-    if oracle_too and known(case.effect):
+    signals = contest.library(design, case.effect)
+    data = built.columns["output"] * np.pi / 180 - design.true["rate"]
+    if known(case.effect):
         knower = oracle(design, built.noise, truth.baseline)
         unit = contest.reduced(knower, signals)
-        wrong = knower.reduce(truth.error[:, None])[:, 0]
-        size = float(np.linalg.norm(wrong))
+        size = knower.norm(truth.error)
         first = contest.oracle_first(unit, knower.reduce(data[:, None])[:, 0], size)
-        needed = contest.separation_needed(unit, str(case.effect), wrong)
-        isolable = size / case.times_mde * 3 >= max(needed.values())
+        isolable = _isolable(case, truth, knower, signals)
     if controls:
         plain = oracle(design, Noise("white", np.sqrt(design.step)), truth.baseline)  # unit variance: least squares
         unit = contest.reduced(plain, signals)
         residual = plain.reduce(data[:, None])[:, 0]
         others = {
             "least_squares_f": contest.least_squares_f(unit, residual, len(truth.baseline)),
+            "hac_f": contest.hac_f(unit, residual),
             "stepwise_bic": contest.stepwise_bic(unit, residual),
             "lasso": contest.lasso(unit, residual),
+            "boosted_trees": contest.boosted_trees(design, residual),
         }
-    answer = run_engine(built, gain and case.noise == "white") if engine else None
+    answer = run_engine(built, **options) if engine else None
     score = judge(truth, design.name, answer, isolable or not known(case.effect)) if answer else None
     return Record(case, truth, answer, score, size, isolable, first, others)
+
+
+def _isolable(case: Case, truth: Truth, knower: Oracle, signals: contest.Library) -> bool:
+    """Whether each hidden effect, the others known, is told from every rival at 3 x MDE."""
+    names = parts(case.effect)
+    for i, name in enumerate(names):
+        beside = knower
+        for other, signal in zip(names, truth.errors, strict=True):
+            # Beside the other as it is, or at any coefficients where it has but one form.
+            block = signals.get(other, np.zeros((0, 0, 0)))
+            taken = block[:, 0] if block.shape[1] == 1 else signal[:, None]
+            if other != name:
+                basis = np.column_stack([knower.basis, knower.reduce(taken / np.abs(taken).max())])
+                beside = replace(knower, basis=np.linalg.qr(basis)[0])
+        rivals = {k: v for k, v in signals.items() if k == name or k not in names}
+        wrong = beside.reduce(truth.errors[i][:, None])[:, 0]
+        needed = contest.separation_needed(contest.reduced(beside, rivals), name, wrong)
+        if np.linalg.norm(wrong) / case.times_mde * 3 < max(needed.values(), default=0.0):
+            return False
+    return True
 
 
 def _seeds(seed: int, count: int) -> list[int]:
@@ -144,7 +209,7 @@ def null_cases(count: int, seed: int, noises: Iterable[str] = FAMILY) -> list[Ca
 
 def effect_cases(count: int, seed: int, times_mde: float, noises: Iterable[str] = FAMILY[:3]) -> list[Case]:
     """Catalogue effects in turn, each in its designs and noises in turn."""
-    names = sorted({e for d in (A, B, C) for e in TESTABLE[d]})
+    names = sorted({e for d in (A, B, C, RUNS) for e in TESTABLE[d]})
     return _in_turn(count, seed, times_mde, tuple(noises), names, TESTABLE)
 
 
@@ -152,6 +217,20 @@ def unknown_cases(count: int, seed: int, times_mde: float, noises: Iterable[str]
     """Effects that no catalogue has, in turn."""
     names = sorted({e for d in UNCATALOGUED for e in UNCATALOGUED[d]})
     return _in_turn(count, seed, times_mde, tuple(noises), names, UNCATALOGUED)
+
+
+def pair_cases(count: int, seed: int, times_mde: float, noises: Iterable[str] = FAMILY[:3]) -> list[Case]:
+    """Two catalogue effects at once, of those that one run tells from noise; neither contains the other."""
+    cells = [
+        (d, n, a, b)
+        for d in (A, B, C)
+        for n in noises
+        for a, b in combinations([e for e in TESTABLE[d] if e not in SLOW], 2)
+        if b != f"{a}_curve"
+    ]
+    order = np.random.default_rng(seed).permutation(len(cells))
+    chosen = [cells[order[i % len(cells)]] for i in range(count)]
+    return [Case(s, d, n, f"{a}+{b}", times_mde) for s, (d, n, a, b) in zip(_seeds(seed, count), chosen, strict=True)]
 
 
 def inseparable_cases(count: int, seed: int) -> list[Case]:
@@ -189,7 +268,7 @@ def _in_turn(
     cases = []
     for i, s in enumerate(_seeds(seed, count)):
         effect, lap = names[i % len(names)], i // len(names)
-        designs = [d for d in (A, B, C) if effect in homes.get(d, ())]
+        designs = [d for d in (A, B, C, RUNS) if effect in homes.get(d, ())]
         cells = [
             (designs[(k + shift) % len(designs)], n) for shift in range(len(designs)) for k, n in enumerate(noises)
         ]
@@ -198,7 +277,7 @@ def _in_turn(
     return cases
 
 
-def run_cases(cases: list[Case], workers: int = 1, **options: bool) -> list[Record]:
+def run_cases(cases: list[Case], workers: int = 1, **options: Any) -> list[Record]:
     """Run cases, in fresh processes when there are several workers (JAX does not fork)."""
     if workers == 1:
         return [run_case(case, **options) for case in cases]
@@ -209,170 +288,38 @@ def run_cases(cases: list[Case], workers: int = 1, **options: bool) -> list[Reco
 
 
 @dataclass(frozen=True)
-class Level:
-    """A measured share against the level it must reach (`at_least`) or stay under."""
+class Confusion:
+    """How often a rival was ranked above the hidden effect: predicted before the data, and counted."""
 
-    row: str
-    measure: str
-    prototype: str
-    must: float
-    at_least: bool
-    count: int
+    design: str
+    effect: str
+    rival: str
+    predicted: float
+    wrong: int
     total: int
 
-    @property
-    def share(self) -> float:
-        return self.count / self.total if self.total else float("nan")
 
-    @property
-    def interval(self) -> tuple[float, float]:
-        """95 % Clopper-Pearson interval."""
-        k, n = self.count, self.total
-        low = beta.ppf(0.025, k, n - k + 1) if k else 0.0
-        high = beta.ppf(0.975, k + 1, n - k) if k < n else 1.0
-        return float(low), float(high)
+def confusion(seed: int, name: str, effect: str, rival: str, predicted: float, draws: int) -> Confusion:
+    """Hide an effect at the size where a rival should be preferred in a given share of campaigns of white noise."""
+    import gyromodel
+    from gyromodel.units import factor, internal_unit
 
-    @property
-    def met(self) -> bool:
-        """The interval does not exclude the level."""
-        return self.interval[1] >= self.must if self.at_least else self.interval[0] <= self.must
-
-    @property
-    def plausible(self) -> bool:
-        """Not worse than the level loosened by 2.5 standard errors: for small samples."""
-        tail = 0.0062
-        if self.at_least:
-            return bool(self.count >= binom.ppf(tail, self.total, self.must))
-        return bool(self.count <= binom.ppf(1 - tail, self.total, self.must))
-
-
-def _scores(records: list[Record]) -> list[Score]:
-    return [r.score for r in records if r.score]
-
-
-def _level(row: str, measure: str, prototype: str, must: float, at_least: bool, flags: list[bool]) -> Level:
-    return Level(row, measure, prototype, must, at_least, sum(flags), len(flags))
-
-
-def null_levels(records: list[Record]) -> list[Level]:
-    """Rows 1, 2 and 15 from campaigns with nothing hidden."""
-    family = [r for r in records if r.case.noise in FAMILY]
-    levels = [
-        _level("1", "false extension, all noises pooled", "0-1.2 %", 0.02, False, [s.detected for s in _scores(family)])
-    ]
-    for noise in (*FAMILY, *OUTSIDE):
-        flags = [r.score.detected for r in records if r.score and r.case.noise == noise]
-        if flags:
-            levels.append(_level("2", f"false extension, {noise.replace('_', ' ')}", "≤ 7.8 %", 0.04, False, flags))
-    claimed = [s.gain_claimed for s in _scores(records)]
-    return [*levels, _level("15", "gain claimed with nothing hidden", "1-2.5 %", 0.05, False, claimed)]
-
-
-SLOW = (
-    "bias_drift",
-    "bias_step",
-    "bias_warmup",
-)  # the rival is the noise itself: judged with the ambiguous, not in row 5
-_ROW4 = {1.0: 0.93, 3.0: 0.97}
-_ROW5 = {1.0: 0.55, 3.0: 0.92, 10.0: 0.99}
-
-
-def effect_levels(records: list[Record]) -> list[Level]:
-    """Rows 4, 5, 6, 7 and 9 from catalogue effects; rows 4 and 5 on isolable campaigns, each row by size."""
-    levels = []
-    for size in sorted({r.case.times_mde for r in records}):
-        group = [r for r in records if r.case.times_mde == size and r.score]
-        alone = [r for r in group if r.isolable and r.case.effect not in SLOW]
-        at = f"{size:g}×"
-        if size in _ROW4:
-            knew = [r.oracle_first == r.case.effect for r in alone]
-            found = [r.score.first_right for r in alone if r.score]
-            must = _ROW4[size] * float(np.mean(knew)) if knew else 0.0
-            levels.append(
-                _level("4", f"first name right ÷ oracle ({np.mean(knew):.3f}), {at}", ".97-1", must, True, found)
-            )
-        if size in _ROW5:
-            named = [r.score.named for r in alone if r.score]
-            levels.append(
-                _level("5", f"detected and named, isolable, {at}", ".56-.76/.92-.99/1", _ROW5[size], True, named)
-            )
-        if size == 3.0:
-            scores = _scores(group)
-            levels += [
-                _level("6", "firm and wrong, catalogue, 3×", "≤ .3 %", 0.01, False, [s.firm_and_wrong for s in scores]),
-                _level(
-                    "7", "95 % set holds the truth, 3×", ".992-1", 0.95, True, [s.in_set for s in scores if s.detected]
-                ),
-                _level("5+", "right verdict, every effect, 3×", "–", 0.92, True, [s.right for s in scores]),
-            ]
-        levels.append(
-            _level(
-                "9",
-                f"catalogue effect called unknown, {at}",
-                "≤ .2 %",
-                0.02,
-                False,
-                [s.called_unknown for s in _scores(group)],
-            )
-        )
-    return levels
-
-
-def mean_set_size(records: list[Record]) -> float:
-    """Row 7: mean size of the credible set at 3 x MDE, isolable campaigns (must be under 1.5)."""
-    sizes = [
-        r.score.set_size for r in records if r.score and r.isolable and r.case.times_mde == 3.0 and r.score.detected
-    ]
-    return float(np.mean(sizes)) if sizes else float("nan")
-
-
-def ambiguity_levels(inseparable: list[Record], drifts: list[Record]) -> list[Level]:
-    """Rows 12 (first half) and 13."""
-    said = [r.score.right and r.answer.verdict == "ambiguous" for r in inseparable if r.score and r.answer]
-    return [
-        _level("12", "campaign that cannot separate: ambiguous with the truth", "–", 0.90, True, said),
-        _level(
-            "13",
-            "drift against random walk: not firmly named",
-            "79/80",
-            0.97,
-            True,
-            [not s.named for s in _scores(drifts)],
-        ),
-    ]
-
-
-def gain_coverage(records: list[Record]) -> Level:
-    """Row 15: in white noise the residual falls by sqrt(1 + lambda^2/n) when the right effect is added."""
-    hits = []
-    for r in records:
-        if r.answer and r.score and r.score.named and r.case.noise == "white":
-            _, low, high = r.answer.gain_ratio
-            hits.append(low <= np.sqrt(1 + r.size**2 / len(r.truth.noise)) <= high)
-    return _level("15", "gain interval covers the true gain, white noise (must: 88-99 %)", "–", 0.88, True, hits)
-
-
-def unknown_levels(records: list[Record]) -> list[Level]:
-    """Rows 6 and 8 from effects that no catalogue has."""
-    levels = []
-    for size, must in ((3.0, 0.85), (10.0, 0.97)):
-        group = _scores([r for r in records if r.case.times_mde == size])
-        if group:
-            flagged = [s for s in group if s.called_unknown]
-            levels.append(
-                _level(
-                    "8",
-                    f"unknown effect flagged, {size:g}×",
-                    ".94-.98 / 1",
-                    must,
-                    True,
-                    [s.called_unknown for s in group],
-                )
-            )
-            levels.append(
-                _level("8", f"driver right, {size:g}×", ".93-1", 0.80, True, [s.driver_right for s in flagged])
-            )
-        if group and size == 3.0:
-            wrong = [s.firm_and_wrong for s in group]
-            levels.append(_level("6", "firm and wrong, unknown effect, 3×", "2-3 %", 0.04, False, wrong))
-    return levels
+    rng = np.random.default_rng(seed)
+    design = DESIGNS[name](rng)
+    noise = draw("white", design, rng)
+    names = [n for n in baseline(design) if n != effect]
+    units = design.units | {"output": "deg/s"}
+    campaign = gyromodel.Campaign(design.columns | {"output": design.true["time"]}, units, design.metadata)
+    stated = gyromodel.GyroModel(gyromodel.model_from_effects(names).effects, {"noise_white": noise.white})
+    if "scale_factor" in names:
+        stated = stated.with_vector(np.eye(len(names))[names.index("scale_factor")])
+    apart = gyromodel.isolability(campaign, stated, tests=False).apart[effect, rival]
+    size = apart.value * factor(apart.unit, internal_unit(apart.unit)) * norm.isf(predicted) / norm.isf(0.05)
+    wrong, lost = error(effect, design, size, {}), 0
+    for _ in range(draws):
+        output = np.rad2deg(design.true["rate"] + wrong + noise.sample(design, rng))
+        measured = campaign.with_column("output", output, "deg/s")
+        found = gyromodel.diagnose(measured, gyromodel.model_from_effects(names), hold_out=False)
+        evidence = {c.effect: c.statistic for c in found.rounds[0].ranking}
+        lost += evidence.get(rival, -np.inf) > evidence.get(effect, -np.inf)
+    return Confusion(name, effect, rival, predicted, lost, draws)

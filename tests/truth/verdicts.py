@@ -10,6 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from .campaigns import Truth, known
+from .mde import parts
+from .motion import LAGS
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,21 @@ ACCEPTED = (
     Accepted("bias_warmup", frozenset(), True, _SLOW),
     Accepted("scale_sagnac_sine", frozenset({"scale_nonlinearity"}), True, "a sine equals a cubic to third order"),
     Accepted("bias_temperature", frozenset(), True, "temperature is a line in time on one ramp", ("static_ramp",)),
+    *(Accepted(e, frozenset(), True, "to first order both are the slope of the rate") for e in LAGS),
+    *(
+        Accepted(
+            e,
+            frozenset(),
+            True,
+            "beside scale factor and bias one direction in the plane is left",
+            ("one_axis_tumble",),
+        )
+        for e in ("misalignment", "bias_acceleration_input", "bias_acceleration_spin")
+    ),
+    *(
+        Accepted(e, frozenset(), True, "each is one turn of the same angle", ("one_field",))
+        for e in ("table_tilt", "bias_magnetic", "table_harmonic")
+    ),
 )
 
 
@@ -40,6 +57,12 @@ class Answer:
     verdict: str
     causes: tuple[str, ...]
     first: str  # top of the first round's ranking, whatever the verdict
+    evidence: dict[str, float]  # of effects in the first round
+    sizes: dict[str, tuple[float, float]]  # each cause's first parameter and its standard error, in SI
+    noise: str  # the likeliest make-up of the noise
+    p_value: float | None  # of the campaign as one with nothing hidden, where that was simulated
+    adequate_after: bool | None  # whether the extended model, diagnosed again, lacks nothing
+    settled: tuple[str, ...] | None  # credible set after the further test that was asked for
     credible: tuple[str, ...]
     driver: tuple[str, ...]
     gain_ratio: tuple[float, float, float]  # value, low, high
@@ -53,7 +76,7 @@ class Score:
 
     right: bool
     detected: bool
-    named: bool  # firmly named, alone
+    named: bool  # firmly named, and nothing else
     firm_and_wrong: bool
     in_set: bool
     set_size: int
@@ -74,21 +97,25 @@ def judge(truth: Truth, design: str, answer: Answer, isolable: bool = True) -> S
     names = frozenset(answer.causes)
     members = names | frozenset(answer.credible)
     driver_right = answer.verdict == "unknown" and set(answer.driver) == set(truth.driver or ())
+    exact = in_set = False
     if truth.effect is None:
         allowed, right = frozenset(), not detected
     elif not known(truth.effect):
         allowed, right = frozenset(), driver_right
     else:
-        allowed, tolerant = _allowed(truth.effect, design)
-        right = (firm and len(names) == 1 and names <= allowed) or (
-            (tolerant or not isolable) and answer.verdict == "ambiguous" and truth.effect in members
+        each = [_allowed(part, design) for part in parts(truth.effect)]
+        allowed, tolerant = frozenset().union(*(names for names, _ in each)), any(t for _, t in each)
+        exact = firm and len(names) == len(each) and names <= allowed and all(names & a for a, _ in each)
+        in_set = all(a & members for a, _ in each)
+        right = exact or (
+            (tolerant or not isolable) and answer.verdict == "ambiguous" and members >= set(parts(truth.effect))
         )
     return Score(
         right=right,
         detected=detected,
-        named=firm and len(names) == 1 and names <= allowed,
+        named=exact,
         firm_and_wrong=firm and not names <= allowed,
-        in_set=bool(allowed & members),
+        in_set=in_set,
         set_size=max(len(answer.credible), 1),
         called_unknown=answer.verdict == "unknown",
         first_right=answer.first in allowed,

@@ -1,0 +1,112 @@
+"""What an unknown discrepancy may follow: columns, their rates, what they were before, and time, as smooth functions.
+
+A driver's name is "smooth(a)" or "smooth(a, b)"; a_rate stands for the rate of column a, a_lagged for its value some
+time before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from gyromodel._checks import DERIVED
+from gyromodel.signals import Record, thermometer_rate
+
+# Length scales of the smooth functions, as parts of the driver's range.
+SMOOTH_SCALES = (0.08, 0.2, 0.5)
+PAIR_SCALES = (0.25, 0.6)
+# A column has a past worth looking at if its steps from row to row are this small beside its own variation; how long
+# before, as parts of a run.
+SLOW, LAGS = 0.05, (0.01, 0.03, 0.08)
+# What `compensate` adds is the output itself.
+NOT_DRIVERS = ("time", "output", "segment", "run", "position", "rate_estimated", "rate_estimated_std")
+
+
+def is_no_driver(name: str) -> bool:
+    """Whether a signal is bookkeeping, the output, or derived from others."""
+    return name in NOT_DRIVERS or bool(DERIVED.fullmatch(name))
+
+
+def unusable(record: Record, name: str) -> str:
+    """Why a column cannot be searched; empty where it can."""
+    values = np.asarray(record.signals[name])[: record.rows][record.present]
+    missing = int((~np.isfinite(values)).sum())
+    if missing:
+        return f"{name} is missing in {missing} of {len(values)} rows"
+    return "" if np.ptp(values) > 0 else f"{name} does not vary"
+
+
+def driver_names(record: Record) -> tuple[str, ...]:
+    """Measured columns that vary: what an unknown discrepancy may follow, besides time."""
+    return tuple(n for n in record.signals if not is_no_driver(n) and not unusable(record, n))
+
+
+def smooths(record: Record) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Name, values of the first column, and columns of each smooth function, one a length scale."""
+    names = driver_names(record)
+    for name in (*names, "time"):
+        yield from _of_one(record, f"smooth({name})", np.asarray(record.signals[name]))
+    for name in (n for n in names if n != "rate" and n != "campaign" and _slow(record, n)):
+        for derived, values in _history(record, name):
+            yield from _of_one(record, f"smooth({derived})", values)
+    rate_first = sorted(names, key=lambda n: n not in ("rate", "temperature"))[:3]
+    for i, a in enumerate(rate_first):
+        for b in rate_first[i + 1 :]:
+            x, y = (np.asarray(record.signals[n]) for n in (a, b))
+            for scale in PAIR_SCALES:
+                of_x, of_y = _bumps(record, x, scale), _bumps(record, y, scale)
+                yield f"smooth({a}, {b})", x, (of_x[:, :, None] * of_y[:, None, :]).reshape(len(x), -1)
+
+
+def smooth_columns(name: str) -> tuple[str, ...]:
+    """The columns a driver candidate's name holds: "smooth(rate, temperature)" → (rate, temperature)."""
+    return tuple(part.strip() for part in name.removeprefix("smooth(").removesuffix(")").split(","))
+
+
+def driver_unit(record: Record, column: str) -> str:
+    """The file's unit of a driver's column."""
+    if column in record.units:
+        return record.units[column]
+    base = column.removesuffix("_rate").removesuffix("_lagged")
+    unit = record.units.get(base, "s")
+    return f"{unit or '1'}/s" if column.endswith("_rate") else unit
+
+
+def _of_one(record: Record, name: str, values: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    for scale in SMOOTH_SCALES:
+        yield name, values, _bumps(record, values, scale)
+
+
+def _bumps(record: Record, values: np.ndarray, scale: float) -> np.ndarray:
+    """Gaussian bumps one length scale apart over the range of a column."""
+    inside = values[: record.rows]
+    centres = np.linspace(0.0, 1.0, round(1.0 / scale) + 1)
+    part = (values - inside.min()) / np.ptp(inside)
+    return np.exp(-0.5 * ((part[:, None] - centres) / scale) ** 2)
+
+
+def _runs(record: Record) -> list[np.ndarray]:
+    number = np.cumsum(np.asarray(record.sampling.restart)[: record.rows])
+    return [np.flatnonzero(number == i) for i in np.unique(number)]
+
+
+def _slow(record: Record, name: str) -> bool:
+    values = np.asarray(record.signals[name])[: record.rows]
+    steps = np.concatenate([np.diff(values[rows]) for rows in _runs(record)])
+    return bool(np.mean(steps**2) < SLOW * np.var(values))
+
+
+def _history(record: Record, name: str) -> Iterator[tuple[str, np.ndarray]]:
+    """The rate of a column, and the column some times before; what came before a run is its first value."""
+    values, time = (np.asarray(record.signals[n])[: record.rows] for n in (name, "time"))
+    extra = (0, len(record.signals["time"]) - record.rows)
+    rate = np.asarray(record.signals.get(f"{name}_rate", np.zeros(0)))[: record.rows]
+    rate = rate if rate.size else thermometer_rate(record, values)
+    if np.isfinite(rate).all() and np.ptp(rate) > 0:
+        yield f"{name}_rate", np.pad(rate, extra, mode="edge")
+    runs = _runs(record)
+    span = max(float(np.ptp(time[rows])) for rows in runs)
+    for lag in LAGS:
+        before = np.concatenate([np.interp(time[rows] - lag * span, time[rows], values[rows]) for rows in runs])
+        yield f"{name}_lagged", np.pad(before, extra, mode="edge")

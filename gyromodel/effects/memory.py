@@ -1,0 +1,76 @@
+"""Effects that remember which way their driver came."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Self
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from gyromodel.effects._base import Effect, Signals, parameter, stack
+from gyromodel.numerics.play import play
+
+# Half widths searched, as parts of the driver's range: a loop wider than the range is never closed.
+NARROWEST, WIDEST, WIDTHS = 0.01, 0.45, 14
+# Samples at least on either branch of a loop, and as a part of all.
+FEWEST, SHARE = 3, 0.02
+
+
+class _Hysteresis(Effect):
+    """A loop over one signal: +height on its way up, −height on its way down, a ramp of twice the half width between.
+
+    The friction of a part that the driver drags along: (x − P[x])/w with the play operator P of half width w. It starts
+    in the middle at the start of every campaign.
+    """
+
+    remembers = True
+    driver: ClassVar[str]
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """(x − P[x])/w, from −1 to 1."""
+        x, time = signals[self.driver], signals["time"]
+        width = self.half_width  # type: ignore[attr-defined]
+        return stack((x - play(x, width, jnp.diff(time, prepend=time[:1]) < 0)) / width)
+
+    def __check_init__(self) -> None:
+        if self.half_width <= 0:  # type: ignore[attr-defined]
+            raise ValueError("half a width is above zero")
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """Loops of which the campaign holds both branches."""
+        x = np.asarray(signals[cls.driver])
+        tried = [cls(half_width=w) for w in np.ptp(x) * np.geomspace(NARROWEST, WIDEST, WIDTHS)]  # type: ignore[call-arg]
+        fewest = max(FEWEST, SHARE * len(x))
+        return [e for e in tried if min(np.sum(s * np.asarray(e.columns(signals)) > 0.99) for s in (-1, 1)) >= fewest]
+
+
+class BiasThermalHysteresis(_Hysteresis):
+    """E += D_H (T − P[T])/w, P the play operator of half width w: a thermal loop that does not depend on ramp speed."""
+
+    id = "bias_thermal_hysteresis"
+    site = "rate"
+    needs = ("temperature",)
+    driver = "temperature"
+    cause = "Potting or a joint of the coil slips when temperature strains it, and stays where it slipped to."
+    test = "Two ramp speeds: the loop over temperature stays as it is, those of lag and Shupe effect grow with speed."
+    untested = "temperature never turns back far enough to close a loop"
+
+    height: Float[Array, ""] = parameter("deg/h", 1.0, "half of the loop's height; positive: higher on the way up")
+    half_width: Float[Array, ""] = parameter("degC", 2.0, "turn that changes sides, half", linear=False, default=2.0)
+
+
+class RateHysteresis(_Hysteresis):
+    """E += D_H (ω − P[ω])/w, P the play operator of half width w: the error depends on which way the rate came."""
+
+    id = "rate_hysteresis"
+    site = "rate"
+    needs = ("rate",)
+    driver = "rate"
+    cause = "Friction, backlash of the pick-off or magnetic remanence of the torquer keeps part of the last turn."
+    test = "Oscillate at two frequencies of one rate amplitude: the loop stays as it is, that of a delay grows."
+    untested = "the rate never turns back far enough to close a loop"
+
+    height: Float[Array, ""] = parameter("deg/h", 1.0, "half of the loop's height; positive: higher on the way up")
+    half_width: Float[Array, ""] = parameter("deg/s", 1.0, "turn that changes sides, half", linear=False, default=0.02)

@@ -1,0 +1,170 @@
+"""Effects that remember or belong to power cycles: simulators against closed forms, and what the search says."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gyromodel as gm
+from gyromodel.compensation import compensate
+from gyromodel.effects.memory import BiasThermalHysteresis
+from gyromodel.effects.thermal import TemperatureLag
+from gyromodel.estimate import Calibration
+from gyromodel.model import GyroModel, ModelError, make_effect
+from gyromodel.numerics.play import play
+from tests.truth import study
+from tests.truth.designs import DESIGNS
+from tests.truth.memory import YIELDS, bias_thermal_hysteresis, dragged, late, with_late_thermometer
+
+
+@pytest.fixture
+def seed(record_property) -> int:
+    value = int(np.random.SeedSequence().generate_state(1)[0])
+    record_property("seed", value)
+    print(f"seed {value}")  # pytest shows it on failure
+    return value
+
+
+def test_relays_drag_along_as_dry_friction_does():
+    """Up by 3 with play of ±0.5, down by 2, up by 0.6: dragged to 2.5, then down to 1.5, then nothing moves."""
+    driver = np.concatenate([np.linspace(0, 3, 50), np.linspace(3, 1, 40), np.linspace(1, 1.6, 20)])
+    follows = dragged(driver, 0.5)
+    assert follows[[0, 49, 89, 109]] == pytest.approx([0.0, 2.5, 1.5, 1.5], abs=0.01)
+
+
+@pytest.mark.parametrize("half_width", [0.3, 1.7])
+def test_play_operator_is_the_sum_of_relays(half_width: float, rng: np.random.Generator):
+    driver = np.cumsum(rng.standard_normal(200))
+    found = play(jnp.asarray(driver), jnp.asarray(half_width), jnp.zeros(200, bool))
+    assert np.asarray(found) == pytest.approx(dragged(driver, half_width), abs=2 * np.ptp(driver) / 400)
+
+
+def test_play_forgets_at_a_restart_and_has_a_derivative_by_its_width(rng: np.random.Generator):
+    driver = jnp.asarray(np.cumsum(rng.standard_normal(300)))
+    restart = jnp.zeros(300, bool).at[120].set(True)
+    whole, second = play(driver, jnp.asarray(0.8), restart), play(driver[120:], jnp.asarray(0.8), restart[:180])
+    assert np.asarray(whole[120:]) == pytest.approx(np.asarray(second), rel=1e-12)
+    slope = jax.jvp(lambda w: play(driver, w, restart), (jnp.asarray(0.8),), (jnp.ones(()),))[1]
+    difference = (
+        play(driver, jnp.asarray(0.8 + 1e-6), restart) - play(driver, jnp.asarray(0.8 - 1e-6), restart)
+    ) / 2e-6
+    assert np.asarray(slope) == pytest.approx(np.asarray(difference), abs=1e-6)
+    assert set(np.unique(np.round(slope, 9))) <= {-1.0, 0.0, 1.0}
+
+
+def test_the_loop_of_friction_has_its_height_at_any_speed(rng: np.random.Generator):
+    """Far from reversals the elements all slip: the loop is ± the amplitude, whatever the speed of the ramp."""
+    design = DESIGNS["static_cycle"](rng)
+    wrong = bias_thermal_hysteresis(design, 2.0, 1.5)
+    assert np.abs(wrong).max() == pytest.approx(2.0, rel=0.02)
+    rising = design.true["temperature_rate"] > 0.5 * design.true["temperature_rate"].max()
+    assert np.quantile(wrong[rising], 0.8) == pytest.approx(2.0, rel=0.02)
+    assert np.mean(YIELDS) == pytest.approx(1.0)
+
+
+def test_a_late_thermometer_lags_a_ramp_by_its_time_constant():
+    time = np.arange(0.0, 4000.0, 2.0)
+    shown = late(time, 20 + 0.01 * time, 150.0)
+    assert (20 + 0.01 * time - shown)[time > 2000] == pytest.approx(1.5, rel=1e-3)
+
+
+def test_a_monotone_ramp_shows_no_loop(rng: np.random.Generator):
+    record = gm.signals.read_signals(
+        gm.Campaign(
+            {"time": np.arange(100.0), "temperature": np.linspace(0, 40, 100), "output": rng.standard_normal(100)},
+            {"time": "s", "temperature": "degC", "output": "deg/h"},
+            {"kind": "rate"},
+        )
+    )
+    assert BiasThermalHysteresis.candidates(record.signals) == []
+
+
+@pytest.mark.parametrize(
+    ("design", "effect"),
+    [
+        ("static_cycle", "bias_thermal_hysteresis"),
+        ("static_cycle", "bias_temperature_product"),
+        ("rate_steps", "rate_hysteresis"),
+        ("rate_temperature", "scale_drift"),
+        ("repeated_runs", "bias_turn_on"),
+    ],
+)
+def test_strong_effects_come_first(design: str, effect: str, seed: int):
+    answer = study.run_case(study.Case(seed, design, "white", effect, 10.0), oracle_too=False).answer
+    assert answer is not None
+    assert answer.first == effect
+    assert effect in answer.causes
+
+
+@pytest.mark.parametrize("effect", ["bias_temperature_rate", "bias_thermal_hysteresis"])
+def test_one_ramp_speed_never_gives_a_firm_wrong_name(effect: str, seed: int):
+    score = study.run_case(study.Case(seed, "one_speed_cycle", "white", effect, 3.0), oracle_too=False).score
+    assert score is not None
+    assert not score.firm_and_wrong
+
+
+def lagging(rng: np.random.Generator, kind: str) -> tuple[gm.Campaign, float]:
+    """A static cycle with a bias over the coil's temperature and a late thermometer, and how late it is (s)."""
+    design = DESIGNS["static_cycle"](rng)
+    tau = rng.uniform(100.0, 300.0)
+    design = with_late_thermometer(design, tau, rng)
+    coil = design.true["coil"] - np.median(design.true["coil"])
+    wrong = coil if kind == "line" else coil**2 / 20
+    output = wrong + 2.0 * rng.standard_normal(len(coil))
+    units = design.units | {"output": "deg/h"}
+    return gm.Campaign(design.columns | {"output": output}, units, dict(design.metadata)), tau
+
+
+def test_a_late_thermometer_under_a_curved_bias_is_named_with_its_delay(seed: int):
+    campaign, tau = lagging(np.random.default_rng(seed), "parabola")
+    found = gm.diagnose(campaign, gm.model_from_effects(["bias", "bias_temperature_curve"]), hold_out=False)
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["temperature_lag"])
+    delay = next(p for p in found.causes[0].parameters if p.name == "time_constant")
+    assert delay.value == pytest.approx(tau, abs=5 * delay.std)
+    assert set(found.extended.model.labels) == {"bias", "temperature_lag"}
+    assert "temperature_lag" not in found.not_testable
+
+
+def test_a_late_thermometer_under_a_straight_bias_is_the_shupe_effect(seed: int):
+    campaign, _ = lagging(np.random.default_rng(seed), "line")
+    found = gm.diagnose(campaign, gm.model_from_effects(["bias", "bias_temperature"]), hold_out=False)
+    assert found.verdict == "ambiguous"
+    assert set(found.credible_set) == {"bias_temperature_rate", "temperature_lag"}
+
+
+def test_a_lag_beyond_reach_is_not_put_beside_the_shupe_effect(seed: int):
+    """A Shupe effect beside a bias so flat over temperature that the thermometer would have to be an hour late."""
+    rng = np.random.default_rng(seed)
+    design = DESIGNS["static_cycle"](rng)
+    output = 0.05 * design.true["temperature"] + 180 * design.true["temperature_rate"]
+    output = output + 0.2 * rng.standard_normal(len(output))
+    units = design.units | {"output": "deg/h"}
+    campaign = gm.Campaign(design.columns | {"output": output}, units, dict(design.metadata))
+    found = gm.diagnose(campaign, gm.model_from_effects(["bias", "bias_temperature"]), hold_out=False)
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["bias_temperature_rate"])
+
+
+def test_a_lag_of_nothing_is_not_testable(rng: np.random.Generator):
+    assert TemperatureLag.continuing([make_effect("bias")]) is None
+    curve = make_effect("bias_temperature_curve")
+    grown = TemperatureLag.continuing([curve])
+    assert grown is not None
+    signals = {
+        "temperature": jnp.asarray(rng.normal(20, 5, 30)),
+        "temperature_rate": jnp.ones(30),
+        "time": jnp.zeros(30),
+    }
+    curve = curve.with_linear(jnp.asarray([1.0, 2.0])).prepared(signals)
+    grown = TemperatureLag.continuing([curve])
+    assert grown is not None
+    assert np.array_equal(grown.contribution(signals), curve.contribution(signals))
+
+
+def test_compensate_refuses_a_memory_of_rates():
+    campaign = gm.Campaign(
+        {"time": np.arange(20.0), "output": np.arange(20.0)}, {"time": "s", "output": "deg/s"}, {"kind": "rate"}
+    )
+    with pytest.raises(ModelError, match="rate_hysteresis looks at earlier rates"):
+        compensate(campaign, Calibration(GyroModel((make_effect("bias"), make_effect("rate_hysteresis")))))

@@ -1,0 +1,250 @@
+"""Specific force, field, geometry and time: simulators against closed forms, and what the diagnosis makes of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gyromodel
+from gyromodel.campaign import Campaign
+from gyromodel.diagnosis import isolability
+from gyromodel.diagnosis._added_tests import added_tests
+from gyromodel.diagnosis._bank import build_bank
+from gyromodel.effects.acceleration import BiasAccelerationSquared
+from gyromodel.effects.dynamics import earlier, lag, slope
+from gyromodel.model import GyroModel, ModelError, model_from_effects
+from gyromodel.plan import read_plan
+from gyromodel.signals import read_signals
+from tests.truth import study
+from tests.truth.effects import error
+from tests.truth.motion_designs import EARTH, MOTION_DESIGNS, Sines, cube_attitudes, earth_and_gravity
+
+DEG_H = np.pi / 180 / 3600
+
+
+def lived(name: str, rng: np.random.Generator):
+    return MOTION_DESIGNS[name](rng)
+
+
+@pytest.mark.parametrize("name", MOTION_DESIGNS)
+def test_designs_are_campaigns_that_could_have_been(name: str, rng: np.random.Generator):
+    design = lived(name, rng)
+    assert 850 <= len(design.index) <= 1050
+    assert set(design.columns) == set(design.units)
+    assert np.array_equal(design.true["time"], design.index * design.step)
+    assert np.std(design.columns["temperature"] - design.true["temperature"]) == pytest.approx(2e-3, rel=0.15)
+    campaign = Campaign(
+        design.columns | {"output": design.columns["time"]}, design.units | {"output": "deg/s"}, design.metadata
+    )
+    assert campaign.metadata["kind"] == "rate"
+
+
+def test_attitudes_turn_gravity_and_the_earth_alike(rng: np.random.Generator):
+    cube = np.array(cube_attitudes())
+    assert len(np.unique(cube.round(9), axis=0)) == 24
+    earth, force = earth_and_gravity(cube, 0.7)
+    assert np.linalg.norm(force, axis=1) == pytest.approx(1.0)
+    assert np.linalg.norm(earth, axis=1) == pytest.approx(EARTH)
+    # The angle between them is that of the latitude, in every attitude.
+    assert np.sum(earth * force, axis=1) == pytest.approx(EARTH * np.sin(0.7))
+    for name in ("tumble", "one_axis_tumble"):
+        design = lived(name, rng)
+        assert len(np.unique(design.columns["position"])) == 36
+        rates = [design.true["rate"], *(design.true[f"rate_{a}"] * DEG_H for a in ("output", "spin"))]
+        assert np.linalg.norm(rates, axis=0) == pytest.approx(EARTH, rel=1e-6)
+        if name == "one_axis_tumble":
+            assert np.ptp(design.true["rate_output"]) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_simulators_follow_their_closed_forms(rng: np.random.Generator):
+    a, b, c = (lived(n, rng) for n in ("tumble", "turntable", "dynamic_rates"))
+    force = {axis: a.true[f"acceleration_{axis}"] for axis in ("input", "output", "spin")}
+    for axis, values in force.items():
+        assert error(f"bias_acceleration_{axis}", a, 3.0, {}) == pytest.approx(3.0 * values)
+    sideways = np.array([[0.0, 0.5, 0.0], [0.5, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    squared = error("bias_acceleration_squared", a, 3.0, {"compliance": sideways})
+    assert squared == pytest.approx(3.0 * force["input"] * force["output"], abs=1e-12)
+    lean = error("misalignment", a, 1e-5, {"towards": (0.6, 0.8)})
+    cross = (0.6 * a.true["rate_output"] + 0.8 * a.true["rate_spin"]) * DEG_H
+    assert lean == pytest.approx(1e-5 * cross, abs=1e-9 * EARTH)
+
+    heading, latitude = b.true["azimuth"], 0.8
+    tilt = error("table_tilt", b, 1e-4, {"at": 0.0, "latitude": latitude})
+    horizontal = EARTH * np.cos(latitude)
+    columns = np.column_stack([np.cos(heading), np.sin(heading), np.ones_like(heading)])
+    found, *_ = np.linalg.lstsq(columns, tilt, rcond=None)
+    assert columns @ found == pytest.approx(tilt, abs=1e-9 * horizontal)
+    assert np.hypot(*found[:2]) == pytest.approx(1e-4 * horizontal, rel=1e-6)
+    lobes = error("table_harmonic", b, 2.0, {"order": 3, "at": 0.5})
+    assert lobes == pytest.approx(2.0 * np.cos(3 * b.true["table_angle"] - 0.5), abs=1e-9)
+
+    rate, spin = c.true["rate"], np.deg2rad(c.true["rate_spin"])
+    assert error("bias_anisoinertia", c, 1e-3, {}) == pytest.approx(1e-3 * rate * spin, rel=1e-9)
+    assert c.true["vibration"] == pytest.approx(c.true["level"] ** 2, rel=0.9)
+    assert np.corrcoef(c.true["vibration"], c.true["level"] ** 2)[0, 1] > 0.95
+
+
+def test_simulated_delay_and_lag_have_their_frequency_response(rng: np.random.Generator):
+    """One sine: a delay turns its phase by −ωδ, a lag multiplies by 1/(1 + iωτ)."""
+    design = lived("dynamic_rates", rng)
+    omega, phase = 2 * np.pi * 3.0, 0.4
+    sine = Sines(np.ones(1), np.array([omega]), np.array([phase]))
+    design = replace(design, motion={"rate": sine, "output": sine})
+    t = design.true["time"]
+    assert error("time_delay", design, 0.013, {}) == pytest.approx(np.sin(omega * (t - 0.013) + phase) - sine(t))
+    for tau in (0.02, 1e-3, 1e-5):
+        response = 1 / (1 + 1j * omega * tau)
+        expected = np.imag(response * np.exp(1j * (omega * t + phase))) - sine(t)
+        assert error("bandwidth", design, tau, {}) == pytest.approx(expected, abs=2e-4 * np.abs(expected).max())
+    assert error("output_axis_acceleration", design, 2.0, {}) == pytest.approx(2 * omega * np.cos(omega * t + phase))
+
+
+def test_delay_lag_and_slope_keep_to_their_stretch():
+    """Two runs end to end, a gap in the first, and padding: against numbers of each stretch alone."""
+    stretches = [np.arange(20.0), 300 + np.arange(15.0), np.arange(12.0)]
+    time = jnp.asarray(np.concatenate([*stretches, np.full(5, 11.0)]))
+    values = jnp.asarray(np.concatenate([np.sin(0.3 * s) for s in stretches] + [np.full(5, np.sin(3.3))]))
+    start = 0
+    for s in stretches:
+        alone = jnp.asarray(s), jnp.asarray(np.sin(0.3 * s))
+        here = slice(start, start + len(s))
+        for of in (lambda t, v: earlier(t, v, jnp.asarray(1.7)), lambda t, v: lag(t, v, jnp.asarray(0.8)), slope):
+            assert np.asarray(of(time, values))[here] == pytest.approx(np.asarray(of(*alone)), abs=1e-12)
+        assert np.asarray(slope(*alone))[2:-2] == pytest.approx(0.3 * np.cos(0.3 * s[2:-2]), abs=1e-3)
+        assert np.asarray(earlier(*alone, jnp.asarray(1.7)))[3:] == pytest.approx(np.sin(0.3 * (s[3:] - 1.7)), abs=1e-3)
+        start += len(s)
+
+
+def campaign_of(design, output: np.ndarray, *without: str) -> Campaign:
+    columns = {k: v for k, v in design.columns.items() if k not in without}
+    units = {k: design.units[k] for k in columns}
+    return Campaign(columns | {"output": np.rad2deg(output)}, units | {"output": "deg/s"}, design.metadata)
+
+
+def test_the_bank_says_what_a_campaign_cannot_show(rng: np.random.Generator):
+    design = lived("tumble", rng)
+    noise = rng.standard_normal(len(design.index))
+    bank = build_bank(read_signals(campaign_of(design, noise)))
+    names = bank.names()
+    assert {"bias_acceleration_input", "bias_acceleration_squared", "misalignment"} <= set(names)
+    # The specific effect has the column: no second name for the same line.
+    assert not any(n in names for n in ("bias_column_acceleration_input", "bias_rate_spin", "bias_column_rate_spin"))
+    assert "centrifuge" in bank.not_testable["part of bias_acceleration_squared"]
+    assert bank.not_testable["bias_magnetic"].startswith("needs a column magnetic_field")
+    assert "in steps" in bank.not_testable["time_delay"]
+    counted = campaign_of(design, noise)
+    counted = counted.with_column("acceleration_input", 1e4 * counted.columns["acceleration_input"], "count")
+    bank = build_bank(read_signals(counted))
+    assert bank.not_testable["bias_acceleration_input"] == "needs a column acceleration_input in a unit like m/s^2"
+    assert "bias_column_acceleration_input" in bank.names()
+    with pytest.raises(ModelError, match=r"bias_acceleration_input needs acceleration_input in a unit like m/s\^2"):
+        gyromodel.fit(counted, model_from_effects(["bias", "bias_acceleration_input"]))
+
+
+def test_columns_by_x_y_z_keep_their_drivers(rng: np.random.Generator):
+    design = lived("tumble", rng)
+    axes = {"input": "x", "output": "y", "spin": "z"}
+    turned = {
+        f"{k.rpartition('_')[0]}_{axes[k.rpartition('_')[2]]}": k
+        for k in design.columns
+        if k.rpartition("_")[2] in axes
+    }
+    plain = campaign_of(design, rng.standard_normal(len(design.index)))
+    columns = {next((n for n, old in turned.items() if old == k), k): v for k, v in plain.columns.items()}
+    units = {next((n for n, old in turned.items() if old == k), k): u for k, u in plain.units.items()}
+    bank = build_bank(read_signals(Campaign(columns, units, plain.metadata)))
+    assert {"bias_acceleration_x", "bias_acceleration_z", "bias_acceleration_squared", "misalignment"} <= set(
+        bank.names()
+    )
+    squared = next(b.effect for b in bank.blocks if b.name == "bias_acceleration_squared" and b.width == 5)
+    assert isinstance(squared, BiasAccelerationSquared)
+    # Six products less one square.
+    assert "acceleration_z*acceleration_z" not in squared.products
+
+
+SUITABLE = [
+    ("tumble", "bias_acceleration_spin"),
+    ("tumble", "bias_acceleration_squared"),
+    ("turntable", "table_tilt"),
+    ("turntable", "bias_magnetic"),
+    ("turntable", "table_harmonic"),
+    ("dynamic_rates", "bias_vibration"),
+    ("dynamic_rates", "bias_anisoinertia"),
+    ("dynamic_rates", "misalignment"),
+    ("dynamic_rates", "output_axis_acceleration"),
+]
+
+
+def told(design: str, effect: str, seed: int):
+    built = study.build(study.Case(seed, design, "white", effect, 10.0))
+    campaign = Campaign(built.columns, built.units, built.metadata)
+    model = model_from_effects(built.truth.baseline)
+    return gyromodel.diagnose(campaign, model, hold_out=False), campaign
+
+
+@pytest.mark.parametrize(("design", "effect"), SUITABLE)
+def test_hidden_effects_of_motion_are_named(design: str, effect: str, seed: int):
+    found, _ = told(design, effect, seed)
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", [effect]), f"seed {seed}"
+
+
+EXACT = {
+    "one_axis_tumble": ({"misalignment", "bias_acceleration_input", "bias_acceleration_spin"}, "by 90° in azimuth"),
+    "one_field": ({"table_tilt", "bias_magnetic", "table_harmonic"}, "Reverse the magnetic field"),
+}
+
+
+@pytest.mark.parametrize("design", EXACT)
+def test_exact_confusions_are_told_of(design: str, seed: int):
+    members, test = EXACT[design]
+    found, campaign = told(design, sorted(members)[seed % 3], seed)
+    assert found.verdict == "ambiguous", f"seed {seed}"
+    assert set(found.credible_set) == members
+    assert found.next_test is not None
+    assert test in found.next_test
+    if design == "one_axis_tumble":
+        # The sentence is of a campaign in which gravity stays and north goes elsewhere.
+        turned = next(
+            t.campaign
+            for t in added_tests(campaign)
+            if t.sentence == "Turn every attitude by 90° in azimuth and repeat."
+        )
+        rates = np.array([turned.si(n) for n in ("rate", "rate_output", "rate_spin")])
+        before = np.array([campaign.si(n) for n in ("rate", "rate_output", "rate_spin")])
+        assert np.linalg.norm(rates, axis=0) == pytest.approx(EARTH, rel=1e-4)
+        force = np.array([campaign.columns[f"acceleration_{a}"] for a in ("input", "output", "spin")])
+        assert np.sum(rates * force, axis=0) == pytest.approx(np.sum(before * force, axis=0), abs=1e-4 * EARTH)
+
+
+def test_delay_and_lag_are_one_to_first_order_and_two_beyond(rng: np.random.Generator, seed: int):
+    small, _ = told("dynamic_rates", "time_delay", seed)
+    assert (small.verdict, set(small.credible_set)) == ("ambiguous", {"time_delay", "bandwidth"}), f"seed {seed}"
+
+
+PLAN = """
+gyro: rig
+kind: rate
+test: multi_position
+rate_frame: inertial
+duration: 60 min
+interval: 10 s
+output: deg/h
+columns:
+  rate: [{for: 20 min, at: 10 deg/h}, {for: 20 min, at: 0 deg/h}, {for: 20 min, at: -10 deg/h}]
+  acceleration_input: [{repeat: 3, segments: [{for: 10 min, at: 1 g}, {for: 10 min, at: -1 g}]}]
+  acceleration_spin: [{for: 30 min, at: 0 g}, {for: 10 min, at: 1 g}, {for: 20 min, at: -0.5 g}]
+  position: [{repeat: 3, segments: [{for: 10 min, at: 1}, {for: 10 min, at: 2}]}]
+"""
+
+
+def test_a_plan_of_positions_tells_what_it_shows(tmp_path):
+    (tmp_path / "plan.yaml").write_text(PLAN, encoding="utf-8")
+    model = GyroModel(model_from_effects(["bias"]).effects, {"noise_white": jnp.asarray(1e-3 * DEG_H)})
+    found = isolability(read_plan(tmp_path / "plan.yaml"), model)
+    assert found.detectable["bias_acceleration_input"].unit == "deg/h/g"
+    assert {"bias_acceleration_spin", "bias_acceleration_squared"} <= set(found.detectable)
+    assert found.not_testable["bias_acceleration_output"] == "needs a column acceleration_output"
+    assert not any("acceleration" in sentence for sentence, _ in found.tests)

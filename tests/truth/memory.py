@@ -1,0 +1,115 @@
+"""Errors that remember, belong to a power cycle or sit in the readout, from parts that do each of it.
+
+Hysteresis is a sum of relays (Preisach), of friction elements whose yields scatter; a late thermometer is a node of a
+thermal network; a converter clips and rounds; a ramp converter has a table of one error a code.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from .designs import RAMP_CODES, Design
+
+Array = np.ndarray
+RELAYS = 400  # across the range of the driver, for each element
+YIELDS = (0.85, 0.95, 1.05, 1.15)  # of the friction elements, over the mean
+
+
+def dragged(driver: Array, half_width: float) -> Array:
+    """What a driver drags along through dry friction: relays that switch up at c + w and down at c − w, summed over c.
+
+    All start as if the driver had come to rest where it starts.
+    """
+    low, high = driver.min() - half_width, driver.max() + half_width
+    spacing = (high - low) / RELAYS
+    centre = low + spacing * (np.arange(RELAYS) + 0.5)
+    # A relay half switched at the start holds the part of the spacing below the driver.
+    state = np.clip((driver[0] - centre) / spacing + 0.5, 0.0, 1.0)
+    total = np.empty_like(driver)
+    for i, x in enumerate(driver):
+        up = np.clip((x - half_width - centre) / spacing + 0.5, 0.0, 1.0)
+        down = np.clip((x + half_width - centre) / spacing + 0.5, 0.0, 1.0)
+        state = np.minimum(np.maximum(state, up), down)
+        total[i] = state.sum()
+    return low + spacing * total
+
+
+def _friction(driver: Array, half_width: float) -> Array:
+    """Mean force of elements that slip at ±1, each driven through its own yield."""
+    return np.mean([(driver - dragged(driver, y * half_width)) / (y * half_width) for y in YIELDS], axis=0)
+
+
+def bias_thermal_hysteresis(design: Design, amplitude: float, half_width: float) -> Array:
+    """Bias from parts that temperature strains until they slip."""
+    time, temperature = design.thermal
+    return amplitude * np.interp(design.true["time"], time, _friction(temperature, half_width))
+
+
+def rate_hysteresis(design: Design, amplitude: float, half_width: float) -> Array:
+    """Error from parts that the rate drags along; the table goes straight from rate to rate."""
+    return amplitude * _friction(design.true["rate"], half_width)
+
+
+def bias_turn_on(design: Design, amplitude: float, offsets: Array) -> Array:
+    """Every power cycle has its own bias."""
+    return amplitude * offsets[design.true["run"].astype(int) - 1]
+
+
+def scale_drift(design: Design, amplitude: float) -> Array:
+    """Scale error that grows with time."""
+    return amplitude * design.true["time"] * design.true["rate"]
+
+
+def bias_readout_code(design: Design, amplitude: float, table: Array) -> Array:
+    """The ramp converter's error at each code, turned into a rate by the loop."""
+    return amplitude * table[design.true["feedback_ramp"].astype(int)]
+
+
+def late(time: Array, node: Array, tau: float) -> Array:
+    """Temperature of a thermometer behind a thermal resistance: τ dT/dt = node − T (implicit Euler)."""
+    share = (time[1] - time[0]) / tau
+    shown = np.empty_like(node)
+    shown[0] = node[0]
+    for i in range(1, len(node)):
+        shown[i] = (shown[i - 1] + share * node[i]) / (1 + share)
+    return shown
+
+
+def with_late_thermometer(design: Design, tau: float, rng: np.random.Generator) -> Design:
+    """The design measured by a thermometer that is τ behind the coil, whose temperature is then `coil`."""
+    time, coil = design.thermal
+    shown = np.interp(design.true["time"], time, late(time, coil, tau))
+    noise = 2e-3 * rng.standard_normal(len(shown))
+    return dataclasses.replace(
+        design,
+        columns=design.columns | {"temperature": shown + noise},
+        true=design.true | {"coil": design.true["temperature"], "temperature": shown},
+    )
+
+
+def clipped(rate: Array, limit: float) -> Array:
+    """A converter that ends at ± its limit."""
+    return np.where(rate > limit, limit, np.where(rate < -limit, -limit, rate))
+
+
+def rounded(output: Array, quantum: float) -> Array:
+    """A converter of whole numbers."""
+    return np.floor(output / quantum + 0.5) * quantum
+
+
+def draw_hysteresis(driver: Array, rng: np.random.Generator) -> dict[str, Any]:
+    """A loop that closes."""
+    return {"half_width": rng.uniform(0.04, 0.2) * np.ptp(driver)}
+
+
+def draw_table(rng: np.random.Generator) -> dict[str, Any]:
+    """One error a code, of unit size: a bow over the ramp, steps where a bit switches, and scatter."""
+    code = np.arange(RAMP_CODES)
+    table = np.sin(np.pi * code / RAMP_CODES) * rng.normal() + 0.2 * rng.standard_normal(RAMP_CODES)
+    for bit in range(1, 5):
+        table += 0.7 * rng.normal() * ((code * 2**bit // RAMP_CODES) % 2)
+    table -= table.mean()
+    return {"table": table / table.std()}
