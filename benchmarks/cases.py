@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -117,9 +118,66 @@ def mems_multiposition_b(folder: Path) -> list[str]:
     return table(head, rows)
 
 
+def mems_attitude(folder: Path) -> list[str]:
+    """Scale factor and lean of one axis from optical attitude, each fit offered to every session."""
+    sessions = {
+        "01": "01_undisturbed_slow_rotation_A",
+        "06": "06_undisturbed_fast_rotation_A",
+        "TStick 02": "TStick_Test02_Trial1",
+        "TStick 04": "TStick_Test04_Trial2",
+    }
+    folder.mkdir(parents=True)
+    model = folder / "simulation.yaml"
+    model.write_text(f"{BIAS}  - effect: scale_factor\n  - effect: misalignment\n")
+    fits, offered = [], []
+    for label, name in sessions.items():
+        path = DATA / f"mems_attitude/{name}.csv.gz"
+        result, _, refusal = command("fit", path, "--model", model, "--axis", "x", "-o", folder / label)
+        if not result:
+            raise SystemExit(refusal)
+        values = [p for p in result["parameters"] if p["effect"] != "bias"]
+        fits.append([label, *(f"{p['value']:.4g} ± {p['std']:.2g}" for p in values)])
+    for label in sessions:
+        row = [label]
+        for name in sessions.values():
+            arguments = (folder / label / "model.yaml", DATA / f"mems_attitude/{name}.csv.gz", "--axis", "x")
+            result, _, refusal = command("compensate", *arguments, "-o", folder / "out.csv")
+            if result:
+                error = result["reference_error"]
+                row.append(f"{error['as_measured']:.3f} → {error['compensated']:.3f}")
+            else:
+                after, before = re.findall(r"(?:rate is|and) ([0-9.]+)", refusal)
+                row.append(f"refused: {before} → {after}")
+        offered.append(row)
+    head = ["session", "scale factor", "lean to y, arcsec", "lean to z, arcsec"]
+    title = "A row's calibration offered to each session: rms error against the attitude's rate, axis x, deg/s."
+    return [*table(head, fits), "", title, "", *table(["fitted on", *sessions], offered)]
+
+
+def rlg_static(folder: Path) -> list[str]:
+    """A dithered ring laser at rest: steps of the output, and noise that is of no usual kind."""
+    rows = []
+    for axis in AXES:
+        path = DATA / "rlg_static/campaign.csv.gz"
+        found, seconds, refusal = command("allan", path, "--axis", axis, "-o", folder / axis)
+        if not found:
+            raise SystemExit(refusal)
+        lines = sorted(found["lines"], key=lambda line: -line["amplitude"])[:3]
+        rows.append([
+            axis, f"{found['quantum'] * 2**13:.6f}", found["noise"]["noise_quantisation"]["verdict"],
+            found["noise"]["noise_random_walk"]["verdict"], ", ".join(f"{x['frequency_hz']:.3f}" for x in lines),
+            str(len(found["misfits"])), f"{seconds:.0f}",
+        ])  # fmt: skip
+    head = ["axis", "step, 2⁻¹³ deg/s", "quantisation noise", "random walk", "strongest lines, Hz",
+            "bands that contradict", "s"]  # fmt: skip
+    return table(head, rows)
+
+
 CASES: dict[str, Callable[[Path], list[str]]] = {
     "mems_multiposition_a": mems_multiposition_a,
     "mems_multiposition_b": mems_multiposition_b,
+    "mems_attitude": mems_attitude,
+    "rlg_static": rlg_static,
 }
 
 

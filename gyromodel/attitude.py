@@ -18,14 +18,14 @@ def with_reference_rates(campaign: Campaign) -> Campaign:
     """The campaign with the rates of its attitude, where it has one and no rate; any other as it is.
 
     The columns `attitude_w/_x/_y/_z` become `rate_x/_y/_z`, relative to the frame of the attitude; rows where the
-    attitude is missing, or too near a gap for its slope, are left out.
+    attitude is missing, or too near a gap for its slope, are left out. Fits and searches then take means over 0.2 s.
 
     Args:
         campaign: the attitude as a quaternion that turns vectors from the gyro's axes to the reference frame; either
             sign is the same attitude.
 
     Raises:
-        CampaignError: there is no stretch of the attitude as long as the window, or it is of no length near one.
+        CampaignError: there is no stretch of the attitude as long as the window, or its length is not one.
     """
     if not set(COLUMNS) <= set(campaign.columns) or any(n.startswith("rate") for n in campaign.columns):
         return campaign
@@ -41,7 +41,7 @@ def with_reference_rates(campaign: Campaign) -> Campaign:
         campaign = campaign.with_column(f"rate_{axis}", values, "rad/s")
     for name in COLUMNS:
         campaign = campaign.without(name)
-    return campaign.select(known)
+    return campaign.select(known).with_metadata({"reference": "attitude"})
 
 
 def body_rates(
@@ -58,7 +58,7 @@ def body_rates(
     """
     step = float(np.median(np.diff(time)))
     half = max(round(WINDOW / step) // 2, FEWEST // 2)
-    good = np.isfinite(attitude).all(axis=1)
+    good = np.asarray(np.isfinite(attitude).all(axis=1))
     # A stretch begins where the row before it is missing or too long ago.
     starts = good & ~(np.r_[False, good[:-1]] & (np.diff(time, prepend=-np.inf) < MISSING_STEP * step))
     stretch = np.where(good, np.cumsum(starts), 0)
@@ -68,7 +68,9 @@ def body_rates(
         if len(q) <= 2 * half:
             continue
         q = q * np.cumprod(np.r_[1.0, np.where(np.sum(q[1:] * q[:-1], axis=1) < 0, -1.0, 1.0)])[:, None]
-        smooth, slope = (savgol_filter(q, 2 * half + 1, 3, deriv=d, delta=step, axis=0)[half:-half].T for d in (0, 1))
+        smooth, slope = (
+            np.asarray(savgol_filter(q, 2 * half + 1, 3, deriv=d, delta=step, axis=0))[half:-half].T for d in (0, 1)
+        )
         (w, v), (dw, dv) = ((q[0], q[1:]) for q in (smooth, slope))
         rate = 2.0 * (w * dv - dw * v - np.cross(v, dv, axis=0)) / np.sum(smooth**2, axis=0)
         rates[first + half : first + half + rate.shape[1]] = rate.T

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from scipy import stats
 
 from gyromodel._checks import thermometers
+from gyromodel.averages import followed
 from gyromodel.campaign import Campaign
 from gyromodel.effects import Signals
 from gyromodel.estimate import Calibration, check_covariates, validity_unit
@@ -94,6 +95,7 @@ def reference_error(compensated: Campaign) -> ReferenceError | None:
     Args:
         compensated: what `compensate` returned.
     """
+    compensated, _ = followed(compensated, len(compensated))
     output, unit = rate_output(compensated)
     if "rate" not in compensated.columns or unit != "rad/s":
         return None

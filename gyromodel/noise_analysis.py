@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, get_args
 
 import numpy as np
+from jaxtyping import Float
 
 from gyromodel._checks import CampaignError
 from gyromodel.campaign import Campaign
@@ -20,6 +21,9 @@ AT_REST = 0.01
 # Averages that end below this part of the longest possible are said to.
 SHORTENED = 0.25
 LENGTHS_PER_DECADE = 10
+# Values closer than this part of the largest are one, rounded in two ways; values of a grid lie on it to this part of a
+# step.
+ROUNDED, OFF_GRID = 1e-9, 0.05
 RATE_UNIT = "deg/h"
 # Units of the coefficients of an angular rate, and for any other output what the rate's unit is multiplied by.
 UNITS = _STATED_UNITS | {
@@ -47,7 +51,10 @@ SYMBOLS = {
 
 @dataclass(frozen=True)
 class NoiseAnalysis:
-    """Deviations by estimator and the identified noise, in the rate's internal unit; `unit` is that of reports."""
+    """Deviations by estimator and the identified noise, in the rate's internal unit; `unit` is that of reports.
+
+    `quantum` is the step of the grid that the output lies on, in the unit of its file; None without one.
+    """
 
     name: str
     deviations: Mapping[str, Deviation]
@@ -56,6 +63,7 @@ class NoiseAnalysis:
     unit: str
     remarks: tuple[str, ...]
     data_hash: str
+    quantum: float | None = None
 
     def unit_of(self, term: str) -> str:
         """Unit in which a coefficient is reported."""
@@ -124,6 +132,7 @@ class NoiseAnalysis:
             "approximate": self.noise.approximate,
             "misfits": [{"from_hz": a, "to_hz": b, "measured_over_fitted": r} for a, b, r in self.noise.misfits],
             "remarks": list(self.remarks),
+            "quantum": self.quantum,
             "data_hash": self.data_hash,
         }
 
@@ -179,8 +188,33 @@ def analyse_noise(campaign: Campaign, progress: Callable[[str, float], None] | N
             "The noise is coloured from the shortest times on and the record is long: its likelihood is approximate, "
             "and intervals are too short."
         )
+    step = quantum(campaign.columns["output"])
+    if step is not None:
+        remarks.append(f"The output comes in steps of {step:.4g} {campaign.units['output']}.")
     shown = RATE_UNIT if unit == "rad/s" else unit
-    return NoiseAnalysis(campaign.name, deviations, noise, unit, shown, tuple(remarks), campaign.digest())
+    return NoiseAnalysis(campaign.name, deviations, noise, unit, shown, tuple(remarks), campaign.digest(), step)
+
+
+def quantum(values: Float[np.ndarray, " sample"]) -> float | None:
+    """The step of the grid that all values lie on; None without one, or where it is too fine for so few values to show.
+
+    Args:
+        values: in any unit; NaN where missing.
+    """
+    levels = np.unique(values[np.isfinite(values)])
+    apart = np.diff(levels)
+    apart = apart[apart > ROUNDED * np.abs(levels).max(initial=0.0)]
+    if not len(apart):
+        return None
+    # Each difference is a whole number of steps, so that dividing by that number tells the step ever better.
+    step = float(apart.min())
+    for reach in np.sort(apart):
+        step = reach / round(reach / step)
+    places = (levels - levels[0]) / step
+    step *= float(places[-1] / round(places[-1]))
+    places = (levels - levels[0]) / step
+    on_grid = np.abs(places - np.round(places)).max() < OFF_GRID
+    return step if on_grid and places[-1] < np.isfinite(values).sum() else None
 
 
 def _nominal(campaign: Campaign, unit: str) -> float | None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import gyromodel as gm
-from gyromodel.diagnosis._average import average
+from gyromodel.averages import average
 from gyromodel.model import ModelError
 from gyromodel.model_files import read_model, write_model
 from gyromodel.signals import rate_output, read_signals

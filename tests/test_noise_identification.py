@@ -15,7 +15,7 @@ from gyromodel.noise import _reduced as reduction
 from gyromodel.noise._identify import KINDS
 from gyromodel.noise._lines import find_lines
 from gyromodel.noise._reduced import Mixture
-from gyromodel.noise_analysis import analyse_noise
+from gyromodel.noise_analysis import analyse_noise, quantum
 from gyromodel.numerics.markov_cells import MarkovCells, Rows, log_determinant_and_gram
 from gyromodel.numerics.maximise import maximise
 from tests.truth import noise as truth
@@ -314,3 +314,13 @@ def test_dithered_ring_laser_log_is_not_called_white(axis: str, measured_data):
     assert not analysis.noise.fits
     assert not {"found", "ambiguous"} & {analysis.noise.terms[key].verdict for key in KINDS}
     assert any("not of these kinds" in remark for remark in analysis.remarks)
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.37])
+def test_the_step_of_an_output_is_found(rng: np.random.Generator, offset: float):
+    """A grid of 0.013 with values rounded to four digits, as files have them; noise that no grid made has no step."""
+    noise = 0.1 * rng.standard_normal(20_000)
+    values = np.round(np.round(noise / 0.013) * 0.013 + offset, 4)
+    values[::9] = np.nan
+    assert quantum(values) == pytest.approx(0.013, rel=1e-3)
+    assert quantum(noise) is quantum(np.round(noise, 9)) is quantum(np.ones(9)) is None

@@ -9,8 +9,8 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 
+from gyromodel.averages import average, followed
 from gyromodel.campaign import Campaign
-from gyromodel.diagnosis._average import average
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores
 from gyromodel.diagnosis._evidence import SAFE_THRESHOLD
@@ -100,7 +100,9 @@ def diagnose(
         for c, posed in zip(given, campaigns, strict=True)
         if posed is not c
     ]
-    shortened = [average(c, seconds=MEAN_OF_POSE * (c is not g)) for c, g in zip(campaigns, given, strict=True)]
+    shortened = [
+        followed(c) if c is g else average(c, seconds=MEAN_OF_POSE) for c, g in zip(campaigns, given, strict=True)
+    ]
     if any(m > 1 for _, m in shortened):
         most = max(m for _, m in shortened)
         findings.append(

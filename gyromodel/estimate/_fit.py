@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gyromodel.averages import followed
 from gyromodel.campaign import Campaign
 from gyromodel.estimate._estimate import Estimate, EstimateError, noise_coefficients
 from gyromodel.estimate._optimistix import optimistix_solution
@@ -45,7 +46,8 @@ def fit(
     """Fit all free parameters of a model to one unit's campaigns together.
 
     Args:
-        campaigns: measured data of one unit; of a multi-position test that numbers no positions, the static poses.
+        campaigns: measured data of one unit; of a multi-position test that numbers no positions, the static poses, and
+            where the reference rate comes from an attitude, means over 0.2 s.
         model: what to fit; `noise` empty estimates white noise, flicker and random walk alongside.
         solver: the package's own solver, or optimistix's.
         progress: called with a line and the fraction done.
@@ -56,7 +58,7 @@ def fit(
         ModelError: the model needs columns the campaign lacks.
     """
     campaigns = [campaigns] if isinstance(campaigns, Campaign) else campaigns
-    record = read_signals([at_rest(c) for c in campaigns])
+    record = read_signals([followed(at_rest(c), len(c))[0] for c in campaigns])
     if progress:
         progress("fitting", 0.1)
     estimate = with_noise_intervals(fit_record(record, model, solver=solver))

@@ -1,4 +1,4 @@
-"""Averages of long campaigns and of poses: the search needs no more rows than resolve the slow effects."""
+"""Means of consecutive samples, where a fit or a search needs no more rows."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from gyromodel.signals import GAP, rate_output
 from gyromodel.units import from_internal
 
 MAXIMUM_ROWS = 20_000
+# Rates from an attitude err by its noise and its smoothing at high frequencies; their means over so long (s) hardly do.
+MEAN_OF_ATTITUDE = 0.2
 
 
 def average(campaign: Campaign, maximum: int = MAXIMUM_ROWS, seconds: float = 0.0) -> tuple[Campaign, int]:
@@ -52,6 +54,11 @@ def average(campaign: Campaign, maximum: int = MAXIMUM_ROWS, seconds: float = 0.
         total, count = (np.add.reduceat(x, starts)[kept] for x in (np.where(seen, values, 0.0), seen.astype(float)))
         columns[name] = np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
     return Campaign(columns, campaign.units, campaign.metadata, campaign.name), together
+
+
+def followed(campaign: Campaign, maximum: int = MAXIMUM_ROWS) -> tuple[Campaign, int]:
+    """As `average`, of a campaign whose reference rate comes from an attitude over as long as the rate is good for."""
+    return average(campaign, maximum, MEAN_OF_ATTITUDE * (campaign.metadata.get("reference") == "attitude"))
 
 
 def _as_rate(campaign: Campaign) -> Campaign:
