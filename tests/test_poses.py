@@ -71,9 +71,9 @@ def test_without_poses_or_accelerations_there_is_a_sentence(rng: np.random.Gener
 
 
 def test_what_gravity_adds_is_named_and_judged_by_means_of_poses():
-    """The truth is 0.002 rad/s per g; noise of 0.01 rad/s a row leaves 0.01/√300 = 6e-4 in the mean of a pose."""
+    """The truth is 0.004 rad/s per g; noise of 0.01 rad/s a row leaves 0.01/√300 = 6e-4 in the mean of a pose."""
     rng = np.random.default_rng(6)
-    wrong, right = (turned(rng, 12, by_gravity)[0] for by_gravity in (2e-3, 0.0))
+    wrong, right = (turned(rng, 16, by_gravity)[0] for by_gravity in (4e-3, 0.0))
     found = gyromodel.diagnose(wrong, gyromodel.model_from_effects(["bias"]))
     assert [cause.effect for cause in found.causes] == ["bias_acceleration_y"]
     assert found.gain.folds == 10

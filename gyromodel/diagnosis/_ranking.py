@@ -70,19 +70,19 @@ class Ranking:
     def twins(self, name: str) -> set[str]:
         """Effects that explain as much of the data as a candidate, with at most one coefficient more.
 
-        Their signals hold the candidate's: no size of it would tell them apart on this campaign. Of those that contain
-        one another only the simplest counts.
+        Their signals hold the candidate's: no size of it would tell them apart on this campaign. A form
+        that contains another which was searched is no twin: it follows whatever that one leaves.
         """
         result = self.results[self.best_cell(name)]
         _, explained, q = result.best[name]
         least = explained - ALIKE * (result.rss - explained) / self.samples
-        alike = {
+        return {
             k
             for k, (_, t, width) in result.best.items()
-            if k != "outliers" and k in self.statistic and not is_driver(k)
+            if k not in (name, "outliers") and k in self.statistic and not is_driver(k)
             and width <= q + 1 and t >= least
+            and not result.best.keys() & set(effect_class(k).supersedes) - {k}
         }  # fmt: skip
-        return {k for k in alike - {name} if not alike & set(effect_class(k).supersedes) - {k}}
 
 
 def is_driver(name: str) -> bool:
