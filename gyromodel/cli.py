@@ -113,8 +113,8 @@ def demo(as_json: AsJson = False) -> None:
     }
     found = {}
     for folder, title in titles.items():
-        result, verdict = _diagnose([folder / "campaign.csv"], folder / "simulation.yaml", folder)
-        found["ring_laser" if folder is table else "fiber_optic"] = result
+        diagnosis, verdict = _diagnose(_read([folder / "campaign.csv"], None), folder / "simulation.yaml", folder)
+        found["ring_laser" if folder is table else "fiber_optic"] = diagnosis.to_dict() | {"model": "model.yaml"}
         if not as_json:
             print(f"{title}\n{verdict}")
             _print_paths(folder, *REPORTS)
@@ -163,16 +163,22 @@ def diagnose(
 ) -> None:
     """Say what the simulation gets wrong, and why.
 
-    Writes the extended model, the gain measured on data it did not see, and a report.
+    Writes the extended model, the gain measured on data it did not see, and a report. Of a three-axis campaign each
+    axis has a folder of its own, and axes.json says how the three lie together.
     """
     if 0 < calibrate < 200:
         raise typer.BadParameter("200 campaigns or more show a 99 % point; 0 takes the safe threshold", param_hint="N")
-    result, verdict = _diagnose(campaigns, model, output, axis=axis, calibrate=calibrate, seed=seed)
+    measured = _read(campaigns, axis)
+    if len(measured[0].outputs) > 1:
+        result, verdict, written = _diagnose_axes(measured, model, output, calibrate, seed)
+    else:
+        diagnosis, verdict = _diagnose(measured, model, output, calibrate=calibrate, seed=seed)
+        result, written = diagnosis.to_dict() | {"model": "model.yaml"}, REPORTS
     if as_json:
         print(_json(result), end="")
     else:
         print(verdict)
-        _print_paths(output, *REPORTS)
+        _print_paths(output, *written)
 
 
 @app.command()
@@ -349,29 +355,49 @@ def effects(
         _print_table(("parameter", "typical", "unit", "meaning"), rows)
 
 
+def _diagnose_axes(
+    measured: Sequence[Campaign], model: Path, output: Path, calibrate: int, seed: int
+) -> tuple[dict[str, Any], str, tuple[str, ...]]:
+    """Diagnose each axis that measures something, and how the axes lie together; the answer, its words, the files."""
+    from gyromodel._checks import CampaignError
+    from gyromodel.three_axes import triad
+
+    axes, said, written, extended = {}, [], [], {}
+    for name in measured[0].outputs:
+        axis = name.removeprefix("output_")
+        try:
+            alone = [campaign.axis(axis) for campaign in measured]
+        except CampaignError as dead:
+            print(f"gyromodel: {dead}", file=sys.stderr)
+            continue
+        diagnosis, verdict = _diagnose(alone, model, output / axis, calibrate=calibrate, seed=seed)
+        axes[axis], extended[axis] = diagnosis.to_dict() | {"model": f"{axis}/model.yaml"}, diagnosis.extended
+        said.append(f"Axis {axis}: {verdict}")
+        written += [f"{axis}/{report}" for report in REPORTS]
+    if not axes:
+        raise CampaignError("no axis measures anything")
+    lie = triad(measured, extended)
+    result = {"axes": axes, "triad": lie and lie.to_dict()}
+    write_text(output / "axes.json", _json(result))
+    return result, "\n".join([*said, *([lie.sentence()] if lie else [])]), (*written, "axes.json")
+
+
 def _diagnose(
-    campaigns: Sequence[Path],
-    model: Path,
-    output: Path,
-    *,
-    axis: str | None = None,
-    calibrate: int = 0,
-    seed: int = 0,
-) -> tuple[dict[str, Any], str]:
-    """Diagnose and write the results; what diagnosis.json holds, and the verdict in a sentence."""
+    measured: Sequence[Campaign], model: Path, output: Path, *, calibrate: int = 0, seed: int = 0
+) -> tuple[Diagnosis, str]:
+    """Diagnose one axis and write the results; and the verdict in a sentence."""
     _prepare(output, model)
     from gyromodel.diagnosis import diagnose as diagnose_campaigns
     from gyromodel.model_files import read_model, write_model
     from gyromodel.report import sentence, write_report
 
-    start, measured = read_model(model), _read(campaigns, axis)
+    start = read_model(model)
     with _progress() as progress:
         diagnosis: Diagnosis = diagnose_campaigns(measured, start, calibrate=calibrate, seed=seed, progress=progress)
-    result = diagnosis.to_dict() | {"model": "model.yaml"}
     write_model(diagnosis.extended, output / "model.yaml")
-    write_text(output / "diagnosis.json", _json(result))
+    write_text(output / "diagnosis.json", _json(diagnosis.to_dict() | {"model": "model.yaml"}))
     write_report(diagnosis, output)
-    return result, sentence(diagnosis)
+    return diagnosis, sentence(diagnosis)
 
 
 def _read(paths: Sequence[Path], axis: str | None) -> list[Campaign]:

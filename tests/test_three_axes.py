@@ -1,0 +1,90 @@
+"""Three sensing axes laid out by rotations of their own: mounting told from angles that are not right."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gyromodel import cli
+from gyromodel.campaign import Campaign
+from gyromodel.estimate import fit
+from gyromodel.files import write_campaign
+from gyromodel.model import model_from_effects
+from gyromodel.three_axes import Triad, triad
+
+ARCSEC = np.deg2rad(1 / 3600)
+ROWS = 240
+
+
+def rates(rng: np.random.Generator) -> np.ndarray:
+    """Turns about each axis and all of them, in steps."""
+    return np.deg2rad(60.0) * rng.uniform(-1, 1, (ROWS // 4, 3)).repeat(4, axis=0)
+
+
+def measured(axes: np.ndarray, rng: np.random.Generator) -> Campaign:
+    """Outputs of three unit vectors' rates, each with a bias and white noise."""
+    rate = rates(rng)
+    output = rate @ axes.T + np.deg2rad([20.0, -10.0, 5.0]) / 3600 + 2e-5 * rng.standard_normal((ROWS, 3))
+    columns = {"time": np.arange(ROWS) * 1.0}
+    columns |= {f"rate_{a}": np.rad2deg(rate[:, i]) for i, a in enumerate("xyz")}
+    columns |= {f"output_{a}": np.rad2deg(output[:, i]) for i, a in enumerate("xyz")}
+    return Campaign(columns, {n: "s" if n == "time" else "deg/s" for n in columns}, {"kind": "rate"})
+
+
+def lie(axes: np.ndarray, rng: np.random.Generator) -> Triad:
+    campaign = measured(axes, rng)
+    found = triad([campaign], {a: fit(campaign.axis(a), model_from_effects(["scale_factor", "bias"])) for a in "xyz"})
+    assert found is not None
+    return found
+
+
+def test_a_turned_unit_is_turned_and_square(rng: np.random.Generator):
+    turn = np.array([300.0, -200.0, 500.0]) * ARCSEC
+    found = lie(Rotation.from_rotvec(turn).as_matrix().T, rng)
+    assert found.turned
+    # Rows of the matrix are the axes; at this noise squareness is known to a few arcsec.
+    assert np.abs(found.rotation - turn).max() < 6 * np.sqrt(np.diag(found.rotation_covariance)).max() + 2 * ARCSEC
+    assert np.abs(found.squareness).max() < 6 * np.sqrt(np.diag(found.squareness_covariance)).max() + 2 * ARCSEC
+    assert "which is the mounting" in found.sentence() or "the mounting;" in found.sentence()
+
+
+def test_axes_that_are_not_square_are_the_unit(rng: np.random.Generator):
+    """Only x is moved, towards y: half of it looks like a turn."""
+    axes = np.eye(3)
+    axes[0] = Rotation.from_rotvec([0, 0, 400 * ARCSEC]).apply([1.0, 0, 0])
+    found = lie(axes, rng)
+    std = np.sqrt(np.diag(found.squareness_covariance))
+    assert found.oblique
+    assert np.abs(found.squareness - np.array([400.0, 0, 0]) * ARCSEC).max() < 6 * std.max()
+    assert "which is the unit" in found.sentence()
+
+
+def test_axes_as_they_should_be_say_so():
+    """A true triad is called turned, or not square, once in a thousand each."""
+    claimed = [t.turned + t.oblique for t in (lie(np.eye(3), np.random.default_rng(s)) for s in range(3))]
+    assert sum(claimed) == 0
+
+
+def test_diagnose_takes_all_axes_of_a_campaign(
+    rng: np.random.Generator, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    axes = Rotation.from_rotvec(np.array([0.0, 0.0, 900.0]) * ARCSEC).as_matrix().T
+    write_campaign(measured(axes, rng), tmp_path / "campaign.csv")
+    (tmp_path / "simulation.yaml").write_text("effects: [{effect: scale_factor}, {effect: bias}]", encoding="utf-8")
+    with pytest.raises(SystemExit) as done:
+        cli.main(["diagnose", str(tmp_path / "campaign.csv"), "--model", str(tmp_path / "simulation.yaml"),
+                  "-o", str(tmp_path / "out")])  # fmt: skip
+    assert done.value.code == 0
+    said = capsys.readouterr().out
+    written = json.loads((tmp_path / "out" / "axes.json").read_text(encoding="utf-8"))
+    assert "misalignment" in [c["effect"] for c in written["axes"]["x"]["causes"]]
+    assert written["axes"]["z"]["verdict"] == "adequate"
+    assert written["triad"]["rotation"]["significant"]
+    assert not written["triad"]["squareness"]["significant"]
+    assert "Axis y: Your simulation lacks" in said
+    assert "900" in said or "899" in said or "901" in said
+    assert (tmp_path / "out" / "x" / "report.html").exists()
