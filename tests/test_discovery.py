@@ -12,14 +12,15 @@ import numpy as np
 import pytest
 
 from tests.truth import levels, study
-from tests.truth.campaigns import TESTABLE, UNCATALOGUED, A, B, C, known
+from tests.truth.campaigns import HOMES, TESTABLE, UNCATALOGUED, known
 from tests.truth.verdicts import ACCEPTED
 
 # Engine calls; tuned so that the file takes minutes on two cores.
 NULLS = 60
-EFFECTS_1, EFFECTS_3, EFFECTS_10 = 17, 51, 17  # multiples of the 17 effects; at 3 x MDE every effect meets three noises
+NAMES = len({e for d in HOMES for e in TESTABLE[d]})
+EFFECTS_1, EFFECTS_3, EFFECTS_10 = 12, 2 * NAMES, 12  # at 3 x MDE every effect meets two noises, else some of them one
 UNKNOWN_3, UNKNOWN_10 = 24, 8  # multiples of the 8 uncatalogued effects
-RETRIES = 9  # further draws of an effect that was missed once
+RETRIES = 8  # further draws of an effect that was missed once
 SLOW = ("bias_drift", "bias_step", "bias_warmup")
 WORKERS = 1 if "PYTEST_XDIST_WORKER" in os.environ else 2
 
@@ -53,23 +54,30 @@ def test_accepted_confusions_name_catalogue_effects_and_give_reasons():
 
 @pytest.mark.long
 def test_nothing_hidden_is_adequate(seed):
-    records = study.run_cases(study.null_cases(NULLS, seed), WORKERS, gain=True)
+    records = study.run_cases(study.null_cases(NULLS, seed), WORKERS)
+    # What is found is found again where its gain is measured, or nothing is gained.
+    found = [r.case for r in records if r.score and r.score.detected]
+    again = study.run_cases(found, WORKERS, gain=True)
+    records = [r for r in records if r.case not in found] + again
     _require(levels.null_levels(records), records, seed)
 
 
 @pytest.mark.long
 def test_hidden_catalogue_effects_are_named(seed):
     sizes = ((1.0, EFFECTS_1), (3.0, EFFECTS_3), (10.0, EFFECTS_10))
-    cases = [c for k, (size, n) in enumerate(sizes) for c in study.effect_cases(n, seed + k, size)]
+    cases = []
+    for k, (size, count) in enumerate(sizes):
+        drawn = study.effect_cases(max(count, NAMES), seed + k, size)
+        cases += [drawn[i] for i in np.random.default_rng(seed + k).permutation(len(drawn))[:count]]
     records = study.run_cases(cases, WORKERS)
     _require(levels.effect_levels(records), records, seed)
     assert levels.mean_set_size(records) <= 1.5
 
-    # No effect may be one that the engine cannot name: if the first three draws were not all right, at least 8 of 12
-    # (5 of 12 for slow changes in time) must be, which is nine tenths (three quarters) loosened by the binomial law.
+    # No effect may be one that the engine cannot name: if the first two draws were not both right, at least 6 of 10
+    # (4 of 10 for slow changes in time) must be, which is nine tenths (three quarters) loosened by the binomial law.
     third = [r for r in records if r.case.times_mde == 3.0]
     missed = {r.case.effect for r in third if r.score and not r.score.right}
-    pool = study.effect_cases(17 * RETRIES, seed + 3, 3.0)
+    pool = study.effect_cases(NAMES * RETRIES, seed + 3, 3.0)
     more = study.run_cases([c for c in pool if c.effect in missed], WORKERS)
     for effect in sorted(map(str, missed)):
         drawn = [r for r in [*third, *more] if r.case.effect == effect]
@@ -97,5 +105,5 @@ def test_an_effect_whose_fit_fails_is_not_found_twice():
 
 def test_every_effect_and_uncatalogued_shape_is_in_a_campaign():
     hidden = {c.effect for c in study.effect_cases(EFFECTS_3, 0, 3.0)}
-    assert hidden == {e for d in (A, B, C) for e in TESTABLE[d]}
+    assert hidden == {e for d in HOMES for e in TESTABLE[d]}
     assert {c.effect for c in study.unknown_cases(UNKNOWN_3, 0, 3.0)} == {e for n in UNCATALOGUED.values() for e in n}

@@ -40,14 +40,14 @@ def fixed(effect: str, parameter: str, value: float, noise: dict[str, float] | N
 
 
 def test_rows_without_a_column_are_left_out_and_said_to_be(rng: np.random.Generator) -> None:
-    vibration = rng.normal(size=ROWS)
-    holes = vibration.copy()
+    sway = rng.normal(size=ROWS)
+    holes = sway.copy()
     holes[::7] = np.nan
-    mostly = np.where(np.arange(ROWS) % 2 == 0, vibration, np.nan)
-    output = 5 * vibration + rng.normal(size=ROWS)
-    found = gm.diagnose(campaign(output, vibration=holes, flag=mostly), gm.model_from_effects(["bias"]), hold_out=False)
-    assert [c.effect for c in found.causes] == ["bias_vibration"]
-    assert f"{len(holes[::7])} rows without vibration were left out." in found.findings
+    mostly = np.where(np.arange(ROWS) % 2 == 0, sway, np.nan)
+    output = 5 * sway + rng.normal(size=ROWS)
+    found = gm.diagnose(campaign(output, sway=holes, flag=mostly), gm.model_from_effects(["bias"]), hold_out=False)
+    assert [c.effect for c in found.causes] == ["bias_sway"]
+    assert f"{len(holes[::7])} rows without sway were left out." in found.findings
     for name in ("bias_flag", "smooth(flag)"):
         assert found.not_testable[name] == "flag is missing in 103 of 205 rows"
 

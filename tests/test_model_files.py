@@ -191,7 +191,7 @@ def test_any_numbers_survive_bit_for_bit(tmp_path: Path, numbers: list[float], p
 
 NEEDED_BESIDES = {
     "acceleration_input", "acceleration_spin", "acceleration_output", "vibration", "rate_spin", "rate_output",
-    "magnetic_field", "azimuth", "table_angle",
+    "magnetic_field", "azimuth", "table_angle", "feedback_ramp",
 }  # fmt: skip
 
 

@@ -161,9 +161,9 @@ def test_each_kind_is_found_beside_white_noise(key: str, size: float, fixed: np.
 
 
 def test_white_noise_alone_is_seldom_anything_else(rng: np.random.Generator):
-    """Twelve records: each other kind exceeds its threshold in 0.5 % of them, and four kinds are tried."""
+    """Eight records: each other kind exceeds its threshold in 0.5 % of them, and four kinds are tried."""
     other, covered = 0, 0
-    for _ in range(12):
+    for _ in range(8):
         found = identified(white(rng))
         term = found.terms["noise_white"]
         assert term.verdict == "found"
@@ -171,8 +171,8 @@ def test_white_noise_alone_is_seldom_anything_else(rng: np.random.Generator):
         rest = [t for name, t in found.terms.items() if name != "noise_white"]
         other += any(t.verdict != "not identifiable" for t in rest)
         assert all(t.low == 0.0 for t in rest if t.verdict == "not identifiable")
-    assert binom.sf(other - 1, 12, 0.03) > RARE
-    assert binom.cdf(covered, 12, 0.93) > RARE
+    assert binom.sf(other - 1, 8, 0.03) > RARE
+    assert binom.cdf(covered, 8, 0.93) > RARE
 
 
 def test_quantisation_alone_is_not_read_as_white_noise(fixed: np.random.Generator):
@@ -210,7 +210,7 @@ def test_limits_of_lines_and_of_unseen_markov_noise_hold(rng: np.random.Generato
     """A line, and a Markov process too small to be found: its bound holds, and is not far above it."""
     time, constant, q = np.arange(ROWS) * STEP, 10.0, 2.5e-3
     hits, bounds = np.zeros(3, int), []
-    for _ in range(16):
+    for _ in range(8):
         line = 0.02 * np.cos(2 * np.pi * 0.3111 * time + rng.uniform(0, 6))
         found = identified(white(rng) + truth.markov(ROWS, STEP, q, constant, rng) + line)
         first, term = found.lines[0], found.terms["noise_markov"]
@@ -219,7 +219,7 @@ def test_limits_of_lines_and_of_unseen_markov_noise_hold(rng: np.random.Generato
         off = abs(first.amplitude - 0.02) / first.std, abs(first.frequency - 0.3111) / first.frequency_std
         hits += [off[0] < 1.96, off[1] < 1.96, bounds[-1] > q]
     for held in hits:
-        assert binom.cdf(held, 16, 0.93) > RARE
+        assert binom.cdf(held, 8, 0.93) > RARE
     assert np.median(bounds) < 3.0 * q
 
 

@@ -21,7 +21,7 @@ from gyromodel.diagnosis._result import Candidate, Diagnosis, Gain, Round
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import Found, NoisePath, Progress, Selection, search, standing
 from gyromodel.diagnosis._shapes import driver_shape, minimum_detectable, not_testable
-from gyromodel.diagnosis._variance import growing_noise, noise_level, quantum, tails, with_variance
+from gyromodel.diagnosis._variance import growing_noise, noise_level, steps_of_output, tails, with_variance
 from gyromodel.diagnosis._verdict import judge
 from gyromodel.estimate import Estimate, EstimateError, check_covariates, fit_record, with_noise_intervals
 from gyromodel.model import GyroModel, record_span
@@ -114,7 +114,7 @@ def diagnose(
         for g, (c, m) in zip(campaigns, shortened, strict=True)
         if m == 1 and len(c) < len(g)
     ]
-    findings += [line for c in given if (line := quantum(c))]
+    findings += [line for c in given if (line := steps_of_output(c))]
     record = read_signals([c for c, _ in shortened])
     check_covariates(record, model)
     record, left_out = with_columns_known(record)

@@ -8,15 +8,15 @@ from scipy import stats
 
 from gyromodel.campaign import Campaign
 from gyromodel.estimate import Estimate
+from gyromodel.noise_analysis import quantum
 from gyromodel.signals import Record
 
 SIGNIFICANT = 1e-5
 HEAVY = 6.0
 # Two-sided significance at which a stated noise level is contradicted.
 CONTRADICTED = 1e-4
-# Steps of the output are said of where each level comes so often, or from this part of the output's scatter on, if
-# there are some levels and nearly all of their differences are whole numbers of steps.
-OFTEN, COARSE, FEWEST_LEVELS, NOT_WHOLE, MOSTLY_WHOLE = 50, 0.5, 5, 0.05, 0.95
+# Steps of the output are said of where each level comes so often, or from this part of the output's scatter on.
+OFTEN, COARSE = 50, 0.5
 
 
 def variance_drivers(record: Record) -> dict[str, np.ndarray]:
@@ -86,20 +86,13 @@ def tails(estimate: Estimate) -> str | None:
     )
 
 
-def quantum(campaign: Campaign) -> str | None:
+def steps_of_output(campaign: Campaign) -> str | None:
     """A sentence where the output comes in steps: in few levels, or in steps as large as its scatter."""
     name = campaign.outputs[0]
     values = campaign.columns[name][np.isfinite(campaign.columns[name])]
-    levels = np.unique(values)
-    if len(levels) < FEWEST_LEVELS:
-        return None
-    steps = np.diff(levels)
-    # Digits of a file that were rounded off leave the same step a little longer or shorter.
-    step = float(np.median(steps[steps < 1.5 * steps.min()]))
+    step = quantum(values)
     scatter = float(np.diff(values).std() / np.sqrt(2.0))
-    whole = np.abs(steps / step - np.round(steps / step)) < NOT_WHOLE
-    few = len(levels) * OFTEN < len(values) or step > COARSE * scatter
-    if not few or np.mean(whole) < MOSTLY_WHOLE:
+    if step is None or not scatter or (step < COARSE * scatter and len(values) < OFTEN * len(np.unique(values))):
         return None
     return (
         f"The output comes in steps of {step:.5g} {campaign.units[name]}, {step / scatter:.2g} times its scatter from "

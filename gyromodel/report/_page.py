@@ -274,10 +274,12 @@ def _noise_kinds(diagnosis: Diagnosis) -> str:
     kinds = list(diagnosis.noise_kinds.items())
     if not kinds:
         return ""
-    name, share = kinds[0]
-    made = listed([title(part).lower() for part in name.split(" + ")])
-    second = f"; {listed([title(p).lower() for p in kinds[1][0].split(' + ')])} with {100 * kinds[1][1]:.0f} %"
-    return f"Most probably {made} ({100 * share:.0f} %{second if len(kinds) > 1 and kinds[1][1] >= 0.05 else ''})."
+
+    def made_of(name: str, share: float) -> str:
+        return f"{listed([title(part).lower() for part in name.split(' + ')])} ({100 * share:.0f} %)"
+
+    likely = [made_of(*kind) for kind in kinds[:2] if kind[1] >= 0.05]
+    return f"Most probably {', or '.join(likely)}."
 
 
 def _searched(diagnosis: Diagnosis) -> list[dict[str, str]]:

@@ -29,6 +29,7 @@ TESTABLE: dict[str, tuple[str, ...]] = {  # catalogue effects that each design c
     RUNS: ("bias_turn_on",),
     LOOP: ("bias_readout_code",),
     "static_ramp": ("bias_temperature", "bias_drift"),
+    "one_speed_cycle": ("bias_temperature", "bias_temperature_rate", "bias_thermal_hysteresis"),
     "tumble": (*_FORCE, "misalignment", "scale_factor", "bias_temperature"),
     "turntable": ("table_tilt", "bias_magnetic", "table_harmonic", "scale_factor", "scale_asymmetry",
                   "bias_temperature"),
@@ -37,6 +38,7 @@ TESTABLE: dict[str, tuple[str, ...]] = {  # catalogue effects that each design c
     "one_axis_tumble": ("misalignment", "bias_acceleration_input", "bias_acceleration_spin"),
     "one_field": ("table_tilt", "bias_magnetic", "table_harmonic"),
 }  # fmt: skip
+HOMES = (A, B, C, RUNS, LOOP)  # designs whose effects the study hides in turn
 MOTION = ("tumble", "turntable", "dynamic_rates")
 UNCATALOGUED: dict[str, tuple[str, ...]] = {
     A: ("temperature_ripple", "rate_ripple", "supply_voltage_ripple", "rate_temperature_bump"),

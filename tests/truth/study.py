@@ -15,7 +15,7 @@ import numpy as np
 from scipy.stats import norm
 
 from . import contest
-from .campaigns import LOOP, MOTION, RUNS, TESTABLE, UNCATALOGUED, A, B, C, Truth, hide, known
+from .campaigns import HOMES, MOTION, TESTABLE, UNCATALOGUED, A, B, C, Truth, hide, known
 from .designs import DESIGNS, Design
 from .effects import error
 from .mde import Oracle, baseline, oracle, parts
@@ -209,7 +209,7 @@ def null_cases(count: int, seed: int, noises: Iterable[str] = FAMILY) -> list[Ca
 
 def effect_cases(count: int, seed: int, times_mde: float, noises: Iterable[str] = FAMILY[:3]) -> list[Case]:
     """Catalogue effects in turn, each in its designs and noises in turn."""
-    names = sorted({e for d in (A, B, C, RUNS, LOOP) for e in TESTABLE[d]})
+    names = sorted({e for d in HOMES for e in TESTABLE[d]})
     return _in_turn(count, seed, times_mde, tuple(noises), names, TESTABLE)
 
 
@@ -268,7 +268,7 @@ def _in_turn(
     cases = []
     for i, s in enumerate(_seeds(seed, count)):
         effect, lap = names[i % len(names)], i // len(names)
-        designs = [d for d in (A, B, C, RUNS, LOOP) if effect in homes.get(d, ())]
+        designs = [d for d in HOMES if effect in homes.get(d, ())]
         cells = [
             (designs[(k + shift) % len(designs)], n) for shift in range(len(designs)) for k, n in enumerate(noises)
         ]
