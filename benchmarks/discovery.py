@@ -267,12 +267,15 @@ def main(argv: list[str] | None = None) -> None:
         return records
 
     seed = args.seed
-    nulls = run("nothing hidden", study.null_cases(many(NULLS), seed), controls=controls, gain=True)
+    at_rest = study.null_cases(many(NULLS) * 2 // 3, seed)
+    nulls = run("nothing hidden", at_rest, controls=controls, gain=True)
+    nulls += run("nothing hidden, moving", study.motion_nulls(many(NULLS) // 3, seed + 3), controls=controls, gain=True)
     outside = run("noise outside the family", study.null_cases(many(NULLS), seed + 1, OUTSIDE), gain=True)
     calibrated = run("calibrated", study.null_cases(many(CALIBRATED), seed + 2), calibrate=DRAWS)
     sized = {}
     for k, (size, count) in enumerate(((0.5, CURVE), (1.0, EFFECTS), (2.0, CURVE), (3.0, EFFECTS), (10.0, EFFECTS))):
-        cases = study.effect_cases(many(count), seed + 10 + k, size, FAMILY)
+        cases = study.effect_cases(many(count) * 2 // 3, seed + 10 + k, size, FAMILY)
+        cases += study.motion_cases(many(count) // 3, seed + 60 + k, size, FAMILY)
         at_three = {"controls": controls, "after": True} if size == 3.0 else {}
         white = [c for c in cases if c.noise == "white"]
         sized[size] = run(f"effects at {size:g} x MDE", [c for c in cases if c not in white], **at_three)
@@ -298,7 +301,9 @@ def main(argv: list[str] | None = None) -> None:
     everything = [*nulls, *outside, *main_sizes, *sized[0.5], *sized[2.0], *uncatalogued, *pairs, *inseparable, *drifts]
     figures = {k: args.output.with_name(f"{args.output.stem}_{k}.png") for k in ("confusion", "power")}
     uniform, lowest, count = levels.uniform_p_values(calibrated)
-    by_design = {d: [r.answer.seconds for r in everything if r.answer and r.case.design == d] for d in study.DESIGNS}
+    by_design: dict[str, list[float]] = {}
+    for r in (r for r in everything if r.answer):
+        by_design.setdefault(r.case.design, []).append(r.answer.seconds)
     in_all = len(everything) + len(calibrated) + 2 * 4 * len(broken) + sum(c.total for c in cells)
     lines = [
         "# Hidden-effect study",

@@ -246,15 +246,18 @@ def drift_cases(count: int, seed: int) -> list[Case]:
 
 
 def motion_cases(count: int, seed: int, times_mde: float, noises: Iterable[str] = FAMILY[:2]) -> list[Case]:
-    """Effects of specific force, field, geometry and time, each in its designs and noises in turn."""
+    """Effects of specific force, field, geometry and time, each in its designs and noises, in an order of the seed."""
     cells = [(d, e, n) for n in noises for d in MOTION for e in TESTABLE[d] if e in MOTION_EFFECTS]
-    return [Case(s, d, n, e, times_mde) for s, (d, e, n) in zip(_seeds(seed, count), cycle(cells), strict=False)]
+    order = cycle(np.random.default_rng(seed).permutation(len(cells)))
+    chosen = [cells[next(order)] for _ in range(count)]
+    return [Case(s, d, n, e, times_mde) for s, (d, e, n) in zip(_seeds(seed, count), chosen, strict=True)]
 
 
 def motion_nulls(count: int, seed: int, noises: Iterable[str] = FAMILY) -> list[Case]:
-    """Nothing hidden in the campaigns that move the gyro."""
+    """Nothing hidden in the campaigns that move the gyro, in an order of the seed."""
     cells = [(d, n) for n in noises for d in MOTION]
-    return [Case(s, d, n) for s, (d, n) in zip(_seeds(seed, count), cycle(cells), strict=False)]
+    order = cycle(np.random.default_rng(seed).permutation(len(cells)))
+    return [Case(s, *cells[next(order)]) for s in _seeds(seed, count)]
 
 
 def _in_turn(
