@@ -173,11 +173,41 @@ def rlg_static(folder: Path) -> list[str]:
     return table(head, rows)
 
 
+def fog_closed_loop_ramp(folder: Path) -> list[str]:
+    """The error of a feedback ramp's codes, fitted on 100 s and judged on the 80 s that follow."""
+    folder.mkdir(parents=True)
+    whole = gyromodel.read_campaign(DATA / "fog_closed_loop_ramp/campaign.csv.gz")
+    first = np.arange(len(whole)) < len(whole) * 5 // 9
+    gyromodel.write_campaign(whole.select(first), folder / "first.csv")
+    (folder / "simulation.yaml").write_text("gyro: fog\neffects:\n  - effect: bias\n")
+    arguments = ("--model", folder / "simulation.yaml", "-o", folder)
+    result, seconds, refusal = command("diagnose", folder / "first.csv", *arguments)
+    if not result:
+        raise SystemExit(refusal)
+    later, extended = read_signals(whole.select(~first)), read_model(folder / "model.yaml")
+    rows = []
+    for label, names in (
+        ("bias alone", ["bias"]),
+        ("and the codes' error", ["bias", "bias_readout_code"]),
+        ("and all that was named", list(extended.labels)),
+    ):
+        model = gyromodel.GyroModel(tuple(e for e in extended.effects if e.label in names))
+        left = np.asarray(later.signals["output"] - model.predict(later.signals))[later.present]
+        rows.append([label, f"{1e9 * left.std():.0f}"])
+    said = f"`diagnose`: {causes(result)}; {seconds:.0f} s."
+    code = next((c for c in result["causes"] if c["effect"] == "bias_readout_code"), None)
+    period = next((p for p in code["parameters"] if p["name"] == "period"), None) if code else None
+    if period:
+        said += f" Period of the codes' error: {period['value']:.5g}."
+    return [said, "", *table(["model, fitted on the first 100 s", "std on the 80 s after, nrad/s"], rows)]
+
+
 CASES: dict[str, Callable[[Path], list[str]]] = {
     "mems_multiposition_a": mems_multiposition_a,
     "mems_multiposition_b": mems_multiposition_b,
     "mems_attitude": mems_attitude,
     "rlg_static": rlg_static,
+    "fog_closed_loop_ramp": fog_closed_loop_ramp,
 }
 
 

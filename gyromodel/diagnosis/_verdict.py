@@ -108,7 +108,10 @@ def judge(
         if ranking is None or name not in ranking.statistic:
             ranking = step.ranking
         statistic = ranking.statistic[name]
-        beside = frozenset(f.name for f in found if f is not step) | {selection.remains}
+        beside = frozenset(f.name for f in found if f is not step)
+        # Where more is left than this explains, this may be a part of it.
+        if selection.last.statistic.get(selection.remains, -np.inf) < statistic:
+            beside |= {selection.remains}
         members = credible(ranking, name, statistic, runs=runs, beside=beside)
         if name == "outliers":
             if scanner.by_points and _unrepeated(record, step.rows):
