@@ -165,17 +165,11 @@ def test_columns_by_x_y_z_keep_their_drivers(rng: np.random.Generator):
     assert "acceleration_z*acceleration_z" not in squared.products
 
 
-SUITABLE = [
-    ("tumble", "bias_acceleration_spin"),
-    ("tumble", "bias_acceleration_squared"),
-    ("turntable", "table_tilt"),
-    ("turntable", "bias_magnetic"),
-    ("turntable", "table_harmonic"),
-    ("dynamic_rates", "bias_vibration"),
-    ("dynamic_rates", "bias_anisoinertia"),
-    ("dynamic_rates", "misalignment"),
-    ("dynamic_rates", "output_axis_acceleration"),
-]
+SUITABLE = {
+    "tumble": ("bias_acceleration_spin", "bias_acceleration_squared"),
+    "turntable": ("table_tilt", "bias_magnetic", "table_harmonic"),
+    "dynamic_rates": ("bias_vibration", "bias_anisoinertia", "misalignment", "output_axis_acceleration"),
+}
 
 
 def told(design: str, effect: str, seed: int):
@@ -185,10 +179,12 @@ def told(design: str, effect: str, seed: int):
     return gyromodel.diagnose(campaign, model, hold_out=False), campaign
 
 
-@pytest.mark.parametrize(("design", "effect"), SUITABLE)
-def test_hidden_effects_of_motion_are_named(design: str, effect: str, seed: int):
+@pytest.mark.parametrize("design", SUITABLE)
+def test_hidden_effects_of_motion_are_named(design: str, seed: int):
+    """One a design, another each time."""
+    effect = SUITABLE[design][seed % len(SUITABLE[design])]
     found, _ = told(design, effect, seed)
-    assert (found.verdict, [c.effect for c in found.causes]) == ("named", [effect]), f"seed {seed}"
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", [effect]), f"seed {seed}, {effect}"
 
 
 EXACT = {

@@ -153,8 +153,9 @@ def run_case(case: Case, *, engine: bool = True, controls: bool = False, **optio
     built = build(case)
     truth, design = built.truth, built.design
     size, isolable, first, others = 0.0, False, "", {}
-    signals = contest.library(design, case.effect)
-    data = built.columns["output"] * np.pi / 180 - design.true["rate"]
+    if controls or known(case.effect):
+        signals = contest.library(design, case.effect)
+        data = built.columns["output"] * np.pi / 180 - design.true["rate"]
     if known(case.effect):
         knower = oracle(design, built.noise, truth.baseline)
         unit = contest.reduced(knower, signals)
