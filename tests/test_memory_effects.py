@@ -31,7 +31,7 @@ def seed(record_property) -> int:
 def test_relays_drag_along_as_dry_friction_does():
     """Up by 3 with play of ±0.5, down by 2, up by 0.6: dragged to 2.5, then down to 1.5, then nothing moves."""
     driver = np.concatenate([np.linspace(0, 3, 50), np.linspace(3, 1, 40), np.linspace(1, 1.6, 20)])
-    follows = dragged(driver, 0.5)
+    follows = dragged(driver, np.array([0.5]))[:, 0]
     assert follows[[0, 49, 89, 109]] == pytest.approx([0.0, 2.5, 1.5, 1.5], abs=0.01)
 
 
@@ -39,7 +39,9 @@ def test_relays_drag_along_as_dry_friction_does():
 def test_play_operator_is_the_sum_of_relays(half_width: float, rng: np.random.Generator):
     driver = np.cumsum(rng.standard_normal(200))
     found = play(jnp.asarray(driver), jnp.asarray(half_width), jnp.zeros(200, bool))
-    assert np.asarray(found) == pytest.approx(dragged(driver, half_width), abs=2 * np.ptp(driver) / 400)
+    assert np.asarray(found) == pytest.approx(
+        dragged(driver, np.array([half_width]))[:, 0], abs=2 * np.ptp(driver) / 400
+    )
 
 
 def test_play_forgets_at_a_restart_and_has_a_derivative_by_its_width(rng: np.random.Generator):

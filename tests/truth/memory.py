@@ -18,34 +18,35 @@ RELAYS = 400  # across the range of the driver, for each element
 YIELDS = (0.85, 0.95, 1.05, 1.15)  # of the friction elements, over the mean
 
 
-def dragged(driver: Array, half_width: float) -> Array:
+def dragged(driver: Array, half_width: Array) -> Array:
     """What a driver drags along through dry friction: relays that switch up at c + w and down at c − w, summed over c.
 
-    All start as if the driver had come to rest where it starts.
+    One column for each half width. All start as if the driver had come to rest where it starts.
     """
-    low, high = driver.min() - half_width, driver.max() + half_width
+    width = np.asarray(half_width)[:, None]
+    low, high = driver.min() - width, driver.max() + width
     spacing = (high - low) / RELAYS
     centre = low + spacing * (np.arange(RELAYS) + 0.5)
     # A relay half switched at the start holds the part of the spacing below the driver.
     state = np.clip((driver[0] - centre) / spacing + 0.5, 0.0, 1.0)
-    total = np.empty_like(driver)
+    total = np.empty((len(driver), len(width)))
     for i, x in enumerate(driver):
-        up = np.clip((x - half_width - centre) / spacing + 0.5, 0.0, 1.0)
-        down = np.clip((x + half_width - centre) / spacing + 0.5, 0.0, 1.0)
+        up = np.clip((x - width - centre) / spacing + 0.5, 0.0, 1.0)
+        down = np.clip((x + width - centre) / spacing + 0.5, 0.0, 1.0)
         state = np.minimum(np.maximum(state, up), down)
-        total[i] = state.sum()
-    return low + spacing * total
+        total[i] = state.sum(axis=1)
+    return low[:, 0] + spacing[:, 0] * total
 
 
 def _friction(driver: Array, half_width: float) -> Array:
     """Mean force of elements that slip at ±1, each driven through its own yield."""
-    return np.mean([(driver - dragged(driver, y * half_width)) / (y * half_width) for y in YIELDS], axis=0)
+    each = np.array(YIELDS) * half_width
+    return np.mean((driver[:, None] - dragged(driver, each)) / each, axis=1)
 
 
 def bias_thermal_hysteresis(design: Design, amplitude: float, half_width: float) -> Array:
     """Bias from parts that temperature strains until they slip."""
-    time, temperature = design.thermal
-    return amplitude * np.interp(design.true["time"], time, _friction(temperature, half_width))
+    return amplitude * _friction(design.true["temperature"], half_width)
 
 
 def rate_hysteresis(design: Design, amplitude: float, half_width: float) -> Array:
