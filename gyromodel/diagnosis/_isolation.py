@@ -15,7 +15,7 @@ from gyromodel.diagnosis._added_tests import added_tests
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._evidence import SAFE_THRESHOLD, explained_for
 from gyromodel.diagnosis._ranking import skipped
-from gyromodel.effects import Effect, Signals
+from gyromodel.effects import CATALOGUE, Effect, Signals
 from gyromodel.effects.drivers import BiasStep
 from gyromodel.estimate import Estimate, filter_of, given_ratios, whiten_columns
 from gyromodel.model import GyroModel, ModelError, make_effect, parameter_unit
@@ -264,6 +264,8 @@ def _sizes(
     left = {name: view.columns_of(effects) for name, effects in forms.items()}
     whole = {name: view.columns_of(effects, whole=True) for name, effects in forms.items()}
     not_testable = dict(bank.not_testable)
+    for name in [n for n in not_testable if n in CATALOGUE and CATALOGUE[n].continuing(model.effects) is not None]:
+        not_testable[name] = "continues an effect of the model, at sizes that only data show: it is not sized before"
     for name in list(left):
         pairs = zip(left[name], whole[name], strict=True)
         if all(np.linalg.norm(rest) <= VANISHED * np.linalg.norm(own) for rest, own in pairs):
