@@ -134,7 +134,7 @@ def test_unknown_noise_is_named():
 
 def test_unknown_effects_and_missing_columns_are_named(rng: np.random.Generator):
     for label in ("bias_column", "bias_", "thermal_bias", ""):
-        with pytest.raises(ModelError, match=r"unknown effect .*; the catalogue has bandwidth, bias, bias_acceleration_input"):
+        with pytest.raises(ModelError, match=r"unknown effect .*; the catalogue has bandwidth, bias, bias_acc"):
             effect_class(label)
     assert effect_class("bias_supply_voltage") is BiasColumn
     record = read_signals(campaign(rng))
