@@ -63,7 +63,8 @@ def filled(label: str, record_signals: Signals, rng: np.random.Generator) -> Eff
             name not in ("breakpoints", "time_constant", "share", "runs", "limit", "period")
             and label != "lock_in_dithered"
         ):
-            size = declared.typical * factor(declared.unit, internal_unit(declared.unit)) if declared.linear else 1.0
+            # 0.8 s/rad: the sine of a Sagnac phase reaches all outputs of the campaign.
+            size = declared.typical * factor(declared.unit, internal_unit(declared.unit)) if declared.linear else 0.8
             values[name] = size * jnp.asarray(rng.uniform(0.3, 1.0, np.shape(getattr(effect, name))))
     return replace(effect, **values)
 

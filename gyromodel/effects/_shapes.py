@@ -1,16 +1,31 @@
-"""Column shapes that several effects share."""
+"""What several effects share: a reference temperature, and the shape of a curve."""
 
 from __future__ import annotations
 
 import itertools
-from typing import Any
+from typing import Any, Self
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from gyromodel.effects._base import Effect, Signals, round_reference, setting
+
 # Powers are of (x − reference)/10, so that their coefficients have the size of the effect over ten degrees.
 POWER_SCALE = 10.0
+
+
+class OverTemperature(Effect):
+    """An effect of T − T0, with T0 the campaign's mean temperature unless it is set."""
+
+    reference: Float[Array, ""] = setting()
+
+    def prepared(self, signals: Signals) -> Self:
+        """Refer to the campaign's mean temperature."""
+        if np.isfinite(float(self.reference)):
+            return self
+        return eqx.tree_at(lambda e: e.reference, self, round_reference(signals["temperature"]))
 
 
 def curve_columns(

@@ -26,6 +26,7 @@ class _Hysteresis(Effect):
 
     remembers = True
     driver: ClassVar[str]
+    height: Float[Array, ""] = parameter("deg/h", 1.0, "half of the loop's height; positive: higher on the way up")
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """(x − P[x])/w, from −1 to 1."""
@@ -57,7 +58,6 @@ class BiasThermalHysteresis(_Hysteresis):
     test = "Two ramp speeds: the loop over temperature stays as it is, those of lag and Shupe effect grow with speed."
     untested = "temperature never turns back far enough to close a loop"
 
-    height: Float[Array, ""] = parameter("deg/h", 1.0, "half of the loop's height; positive: higher on the way up")
     half_width: Float[Array, ""] = parameter("degC", 2.0, "turn that changes sides, half", linear=False, default=2.0)
 
 
@@ -72,5 +72,4 @@ class RateHysteresis(_Hysteresis):
     test = "Oscillate at two frequencies of one rate amplitude: the loop stays as it is, that of a delay grows."
     untested = "the rate never turns back far enough to close a loop"
 
-    height: Float[Array, ""] = parameter("deg/h", 1.0, "half of the loop's height; positive: higher on the way up")
     half_width: Float[Array, ""] = parameter("deg/s", 1.0, "turn that changes sides, half", linear=False, default=0.02)

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from gyromodel.effects._base import Effect, Signals, parameter, round_reference, setting, stack
-from gyromodel.effects._shapes import check_curve, curve_columns, curve_forms
+from gyromodel.effects._base import Effect, Signals, parameter, setting, stack
+from gyromodel.effects._shapes import OverTemperature, check_curve, curve_columns, curve_forms
 
 
 class ScaleFactor(Effect):
@@ -139,7 +139,7 @@ class ScaleSagnacSine(Effect):
         return [cls(kappa=phase / top) for phase in np.geomspace(0.1, 3.0, 12)] if top > 0 else []
 
 
-class ScaleTemperature(Effect):
+class ScaleTemperature(OverTemperature):
     """ε += ε_T (T − T0): scale factor proportional to temperature."""
 
     id = "scale_temperature"
@@ -149,17 +149,10 @@ class ScaleTemperature(Effect):
     test = "Positive and negative rates at each temperature: a bias over temperature does not change sign."
 
     coefficient: Float[Array, ""] = parameter("ppm/degC", 10.0, "relative change per degree")
-    reference: Float[Array, ""] = setting()
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """T − T0."""
         return stack(signals["temperature"] - self.reference)
-
-    def prepared(self, signals: Signals) -> Self:
-        """Refer to the campaign's mean temperature."""
-        if np.isfinite(float(self.reference)):
-            return self
-        return eqx.tree_at(lambda e: e.reference, self, round_reference(signals["temperature"]))
 
 
 class ScaleDrift(Effect):
@@ -178,7 +171,7 @@ class ScaleDrift(Effect):
         return stack(signals["time"])
 
 
-class ScaleTemperatureCurve(Effect):
+class ScaleTemperatureCurve(OverTemperature):
     """ε += Σ a_i ((T − T0)/10 °C)^i + Σ h_j max(T − T_j, 0): scale factor curved over temperature."""
 
     id = "scale_temperature_curve"
@@ -191,7 +184,6 @@ class ScaleTemperatureCurve(Effect):
     coefficients: Float[Array, " order"] = parameter("ppm", 100.0, "power i: part per (10 °C)^i", default=(0.0, 0.0))
     hinges: Float[Array, " hinge"] = parameter("ppm/degC", 10.0, "change of slope at each breakpoint", default=())
     breakpoints: Float[Array, " hinge"] = parameter("degC", 10.0, "where the slope changes", linear=False, default=())
-    reference: Float[Array, ""] = setting()
 
     def __check_init__(self) -> None:
         check_curve(self.coefficients, self.hinges, self.breakpoints)
@@ -200,12 +192,6 @@ class ScaleTemperatureCurve(Effect):
         """Powers of (T − T0)/10 °C, from the first on, then max(T − T_j, 0) of each breakpoint."""
         powers = self.coefficients.shape[0]
         return curve_columns(signals["temperature"], self.reference, powers, self.breakpoints)
-
-    def prepared(self, signals: Signals) -> Self:
-        """Refer to the campaign's mean temperature."""
-        if np.isfinite(float(self.reference)):
-            return self
-        return eqx.tree_at(lambda e: e.reference, self, round_reference(signals["temperature"]))
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:

@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from gyromodel._checks import thermometers
-from gyromodel.effects._base import Effect, Signals, parameter, round_reference, setting, stack
-from gyromodel.effects._shapes import POWER_SCALE, check_curve, curve_columns, curve_forms
+from gyromodel.effects._base import Effect, Signals, parameter, stack
+from gyromodel.effects._shapes import POWER_SCALE, OverTemperature, check_curve, curve_columns, curve_forms
 
 
-class BiasTemperature(Effect):
+class BiasTemperature(OverTemperature):
     """E += D_T (T − T0): bias proportional to temperature."""
 
     id = "bias_temperature"
@@ -27,20 +27,13 @@ class BiasTemperature(Effect):
     test = "Heat and then cool: a drift in time does not come back."
 
     coefficient: Float[Array, ""] = parameter("deg/h/degC", 1.0, "bias change per degree")
-    reference: Float[Array, ""] = setting()
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """T − T0."""
         return stack(signals["temperature"] - self.reference)
 
-    def prepared(self, signals: Signals) -> Self:
-        """Refer to the campaign's mean temperature."""
-        if np.isfinite(float(self.reference)):
-            return self
-        return eqx.tree_at(lambda e: e.reference, self, round_reference(signals["temperature"]))
 
-
-class BiasTemperatureCurve(Effect):
+class BiasTemperatureCurve(OverTemperature):
     """E += Σ a_i ((T − T0)/10 °C)^i + Σ h_j max(T − T_j, 0): bias curved over temperature."""
 
     id = "bias_temperature_curve"
@@ -53,7 +46,6 @@ class BiasTemperatureCurve(Effect):
     coefficients: Float[Array, " order"] = parameter("deg/h", 1.0, "power i: bias per (10 °C)^i", default=(0.0, 0.0))
     hinges: Float[Array, " hinge"] = parameter("deg/h/degC", 1.0, "change of slope at each breakpoint", default=())
     breakpoints: Float[Array, " hinge"] = parameter("degC", 10.0, "where the slope changes", linear=False, default=())
-    reference: Float[Array, ""] = setting()
 
     def __check_init__(self) -> None:
         check_curve(self.coefficients, self.hinges, self.breakpoints)
@@ -62,12 +54,6 @@ class BiasTemperatureCurve(Effect):
         """Powers of (T − T0)/10 °C, from the first on, then max(T − T_j, 0) of each breakpoint."""
         powers = self.coefficients.shape[0]
         return curve_columns(signals["temperature"], self.reference, powers, self.breakpoints)
-
-    def prepared(self, signals: Signals) -> Self:
-        """Refer to the campaign's mean temperature."""
-        if np.isfinite(float(self.reference)):
-            return self
-        return eqx.tree_at(lambda e: e.reference, self, round_reference(signals["temperature"]))
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
@@ -91,7 +77,7 @@ class BiasTemperatureRate(Effect):
         return stack(signals["temperature_rate"])
 
 
-class BiasTemperatureProduct(Effect):
+class BiasTemperatureProduct(OverTemperature):
     """E += D (T − T0) dT/dt: a Shupe effect that changes with temperature."""
 
     id = "bias_temperature_product"
@@ -103,20 +89,13 @@ class BiasTemperatureProduct(Effect):
     test = "The same ramp at a low and at a high temperature: the Shupe effect is the same in both, this is not."
 
     coefficient: Float[Array, ""] = parameter("deg/h/(degC^2/s)", 30.0, "change of the Shupe coefficient per degree")
-    reference: Float[Array, ""] = setting()
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """(T − T0) dT/dt of the smoothed thermometer."""
         return stack((signals["temperature"] - self.reference) * signals["temperature_rate"])
 
-    def prepared(self, signals: Signals) -> Self:
-        """Refer to the campaign's mean temperature."""
-        if np.isfinite(float(self.reference)):
-            return self
-        return eqx.tree_at(lambda e: e.reference, self, round_reference(signals["temperature"]))
 
-
-class TemperatureLag(Effect):
+class TemperatureLag(OverTemperature):
     """E += b(T + τ dT/dt), b(u) = Σ a_i ((u − T0)/10 °C)^i + Σ h_j max(u − T_j, 0): the thermometer is late by τ.
 
     It contains the bias over temperature, b, and equals it for τ = 0. Where b is a line of slope a it is
@@ -136,7 +115,6 @@ class TemperatureLag(Effect):
     hinges: Float[Array, " hinge"] = parameter("deg/h/degC", 1.0, "change of slope at each breakpoint", default=())
     breakpoints: Float[Array, " hinge"] = parameter("degC", 10.0, "where the slope changes", linear=False, default=())
     time_constant: Float[Array, ""] = parameter("s", 100.0, "how late the thermometer is", linear=False)
-    reference: Float[Array, ""] = setting()
 
     def __check_init__(self) -> None:
         check_curve(self.coefficients, self.hinges, self.breakpoints)
@@ -145,12 +123,6 @@ class TemperatureLag(Effect):
         """Those of the curve, at the temperature that the thermometer will show."""
         ahead = signals["temperature"] + self.time_constant * signals["temperature_rate"]
         return curve_columns(ahead, self.reference, self.coefficients.shape[0], self.breakpoints)
-
-    def prepared(self, signals: Signals) -> Self:
-        """Refer to the campaign's mean temperature."""
-        if np.isfinite(float(self.reference)):
-            return self
-        return eqx.tree_at(lambda e: e.reference, self, round_reference(signals["temperature"]))
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
