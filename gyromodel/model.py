@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from gyromodel._checks import of_usual_unit, usual_unit
@@ -18,7 +20,7 @@ from gyromodel.declarations import column_of
 from gyromodel.effects import CATALOGUE, Effect, Signals
 from gyromodel.effects._base import evaluate, lacking
 from gyromodel.effects.drivers import BiasColumn
-from gyromodel.noise import NOISE_UNITS, NoiseRatios, markov_sum
+from gyromodel.noise import NOISE_UNITS, NoiseRatios, markov_sum, stated_ratios
 from gyromodel.numerics.state_space import build_filter, colour
 from gyromodel.signals import Record, read_signals
 from gyromodel.units import convertible, from_internal
@@ -125,14 +127,15 @@ class GyroModel(eqx.Module):
         values = [jnp.ravel(getattr(self.effects[i], name)) for i, name in self._fields()]
         return jnp.concatenate(values) if values else jnp.zeros(0)
 
-    def with_vector(self, vector: Float[Array, " parameter"]) -> GyroModel:
+    def with_vector(self, vector: Float[Array | np.ndarray, " parameter"]) -> GyroModel:
         """The model at other values of its free parameters."""
-        effects, start = list(self.effects), 0
-        for i, name in self._fields():
-            old = getattr(effects[i], name)
-            new = jnp.reshape(vector[start : start + jnp.size(old)], jnp.shape(old))
-            effects[i] = eqx.tree_at(lambda e, name=name: getattr(e, name), effects[i], new)
-            start += jnp.size(old)
+        vector, effects, start = on_host(vector), list(self.effects), 0
+        for i, fields in itertools.groupby(self._fields(), lambda place: place[0]):
+            names, new = [name for _, name in fields], []
+            for old in (getattr(effects[i], name) for name in names):
+                new.append(jnp.asarray(vector[start : start + np.size(old)].reshape(np.shape(old))))
+                start += np.size(old)
+            effects[i] = eqx.tree_at(lambda e, names=names: [getattr(e, name) for name in names], effects[i], new)
         return eqx.tree_at(lambda m: m.effects, self, tuple(effects))
 
     def _sites(self, signals: Signals) -> tuple[Array, Array, Array]:
@@ -177,31 +180,56 @@ class GyroModel(eqx.Module):
         weight = gain * scale if effect.site == "rate" else gain * rate
         return weight[:, None] * effect.columns(signals)
 
-    def linearise(self, signals: Signals) -> tuple[Float[Array, " sample"], Float[Array, "sample parameter"]]:
-        """The prediction and its Jacobian by the free parameters: columns, and one jvp per nonlinear parameter."""
-        rate = signals.get("rate", jnp.zeros_like(signals["time"]))
-        scale = jnp.ones_like(rate)
-        pieces = [None if e.site == "gain" else evaluate(e, signals) for e in self.effects]
+    def steady_columns(self, signals: Signals) -> dict[int, np.ndarray]:
+        """Columns that no parameter changes, by the place of their effect in the model."""
+        return {
+            i: np.asarray(evaluate(effect, signals)[0])
+            for i, effect in enumerate(self.effects)
+            if effect.site != "gain" and all(declared.linear for declared in effect.declared().values())
+        }
+
+    def linearise(
+        self, signals: Signals, steady: Mapping[int, np.ndarray] | None = None
+    ) -> tuple[Float[Array | np.ndarray, " sample"], Float[Array | np.ndarray, "sample parameter"]]:
+        """The prediction and its Jacobian by the free parameters: columns, and one jvp per nonlinear parameter.
+
+        In NumPy where nothing is traced. `steady` are the signals' `steady_columns`, where they are at hand.
+        """
+        rate = on_host(signals.get("rate", jnp.zeros_like(signals["time"])))
+        scale = 1.0 + 0.0 * rate
+        pieces = []
+        for i, effect in enumerate(self.effects):
+            if steady is not None and i in steady:
+                pieces.append((steady[i], None, steady[i] @ on_host(effect.linear())))
+            else:
+                pieces.append(None if effect.site == "gain" else [on_host(x) for x in evaluate(effect, signals)])
         for effect, piece in zip(self.effects, pieces, strict=True):
             if piece is not None and effect.site == "rate":
                 rate = rate + piece[2]
             elif piece is not None:
                 scale = scale + piece[2]
-        gain = self.gain()
+        gain = on_host(self.gain())
         prediction = gain * rate * scale
         by_rate, by_scale = gain * scale, gain * rate
         columns = []
         for i, name in self._fields():
             effect, piece = self.effects[i], pieces[i]
             if piece is None:
-                columns.append((prediction / effect.value)[:, None])  # type: ignore[attr-defined]
+                columns.append((prediction / on_host(effect.value))[:, None])  # type: ignore[attr-defined]
                 continue
             linear = effect.declared()[name].linear
             alike = [k for k, declared in effect.declared().items() if declared.linear == linear]
-            first = sum(jnp.size(getattr(effect, k)) for k in alike[: alike.index(name)])
-            part = piece[0 if linear else 1][:, first : first + jnp.size(getattr(effect, name))]
+            first = sum(np.size(getattr(effect, k)) for k in alike[: alike.index(name)])
+            part = piece[0 if linear else 1][:, first : first + np.size(getattr(effect, name))]
             columns.append((by_rate if effect.site == "rate" else by_scale)[:, None] * part)
-        return prediction, jnp.concatenate(columns, axis=1) if columns else jnp.zeros((prediction.shape[0], 0))
+        if not columns:
+            return prediction, np.zeros((prediction.shape[0], 0))
+        return prediction, (np if isinstance(prediction, np.ndarray) else jnp).concatenate(columns, axis=1)
+
+
+def on_host(values: Any) -> Any:
+    """Values as a NumPy array, where small steps are quick; what JAX is tracing stays as it is."""
+    return values if isinstance(values, Tracer) else np.asarray(values)
 
 
 def effect_class(label: str) -> type[Effect]:
@@ -296,25 +324,23 @@ def simulate(model: GyroModel, campaign: Campaign, seed: int = 0) -> Campaign:
 
 def draw_noise(model: GyroModel, record: Record, rng: np.random.Generator) -> np.ndarray:
     """One draw of the model's noise in output units, through the same state-space form that whitens it."""
-    white = float(model.noise.get("noise_white", 0.0))
     if not model.noise:
         return np.zeros(record.rows)
-    if white <= 0:
-        raise ModelError("noise needs a noise_white above zero")
-    variance = white**2 / record.interval
-    ratios = NoiseRatios(
-        jnp.asarray(model.noise.get("noise_flicker", 0.0) ** 2 / variance),
-        jnp.asarray(model.noise.get("noise_random_walk", 0.0) ** 2 * record.interval / variance),
-    )
+    try:
+        ratios = stated_ratios(model.noise, record.interval)
+    except ValueError as problem:
+        raise ModelError(str(problem)) from None
+    variance = float(model.noise["noise_white"]) ** 2 / record.interval
     draws = jnp.asarray(rng.standard_normal(len(record.sampling.present)))
     sampling = record.sampling._replace(present=jnp.ones_like(record.sampling.present))
-    noise = _realise(ratios, record.interval, record_span(record), sampling, draws)
+    longest = float(ratios.longest(record_span(record)))
+    noise = _realise(ratios, record.interval, longest, sampling, draws)
     return np.asarray(noise)[: record.rows] * np.sqrt(variance) * abs(float(model.gain()))
 
 
 @jax.jit
-def _realise(ratios: NoiseRatios, interval, span, sampling, draws):
-    return colour(build_filter(markov_sum(ratios, interval, span), sampling), draws)
+def _realise(ratios: NoiseRatios, interval, longest, sampling, draws):
+    return colour(build_filter(markov_sum(ratios, interval, longest), sampling), draws)
 
 
 def record_span(record: Record) -> float:

@@ -18,7 +18,7 @@ from gyromodel.effects import Effect
 from gyromodel.effects.drivers import BiasColumn
 from gyromodel.estimate import Calibration, Estimate, validity_unit
 from gyromodel.model import GyroModel, ModelError, make_effect, parameter_unit
-from gyromodel.noise import NOISE_UNITS
+from gyromodel.noise import MARKOV_TIME, NOISE_UNITS, check_stated
 from gyromodel.numerics.uncertain import Uncertain
 from gyromodel.signals import Record
 from gyromodel.units import UnitError, convertible, factor, from_internal, internal_unit, quantity, to_internal
@@ -295,19 +295,26 @@ def _read_noise(place: _Place) -> dict[str, float]:
         return {}
     noise: dict[str, float] = {}
     for item in place.items("noise"):
-        entry = item.mapping(("effect", "value", "lo", "hi"), "a noise entry")
+        entry = item.mapping(("effect", "value", "lo", "hi", "time_constant"), "a noise entry")
         if "effect" not in entry or "value" not in entry:
             raise item.error("each noise entry needs an effect: id and a value")
         name = entry["effect"].text()
-        if name not in NOISE_UNITS:
-            raise entry["effect"].error(f"unknown noise {name}; known are {', '.join(NOISE_UNITS)}")
+        known = [k for k in NOISE_UNITS if k != MARKOV_TIME]
+        if name not in known:
+            raise entry["effect"].error(f"unknown noise {name}; known are {', '.join(known)}")
         if name in noise:
             raise entry["effect"].error(f"{name} appears twice")
         noise[name] = entry["value"].number_in(NOISE_UNITS[name])
         if noise[name] < 0:
             raise entry["value"].error(f"{name} cannot be negative")
-    if noise.get("noise_white", 0.0) <= 0:
-        raise place.error("a noise list needs a noise_white above zero")
+        if "time_constant" in entry:
+            if name != "noise_markov":
+                raise entry["time_constant"].error(f"{name} has no time_constant")
+            noise[MARKOV_TIME] = entry["time_constant"].number_in(NOISE_UNITS[MARKOV_TIME])
+    try:
+        check_stated(noise)
+    except ValueError as problem:
+        raise place.error(str(problem)) from None
     return noise
 
 
@@ -351,8 +358,10 @@ def _document(model: GyroModel, estimate: Estimate | None) -> dict[str, Any]:
         if fixed:
             entry["fixed"] = True if len(fixed) == len(effect.declared()) else fixed
         document["effects"].append(entry)
-    noise = [{"effect": k, "value": _exact_text(float(v), NOISE_UNITS[k])} for k, v in model.noise.items()]
-    document["noise"] = noise or "auto"
+    noise = {k: {"effect": k, "value": _exact_text(float(v), NOISE_UNITS[k])} for k, v in model.noise.items()}
+    if MARKOV_TIME in noise:
+        noise["noise_markov"]["time_constant"] = noise.pop(MARKOV_TIME)["value"]
+    document["noise"] = list(noise.values()) or "auto"
     if estimate and record:
         document["fit"] = _fit_record(estimate)
         document["software"] = f"gyromodel {__version__}"

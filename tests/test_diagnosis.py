@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import integrate, stats
+from scipy.signal import lfilter
 from scipy.special import gammaln
 
 import gyromodel as gm
@@ -217,6 +218,18 @@ def test_noise_that_the_model_does_not_state_is_a_cause(rng: np.random.Generator
     quiet = gm.diagnose(static_log(rng), stated(gm.model_from_effects(["bias"])), hold_out=False)
     assert quiet.verdict == "adequate"
     assert not any("The noise is" in line for line in quiet.findings)
+
+
+def test_markov_noise_that_the_model_does_not_state_is_a_cause() -> None:
+    """Examples (fixed seeds) of processes of ten samples, 20 times the white variance at that time: never a walk."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        drift = lfilter([1.0], [1.0, -np.exp(-0.1)], 0.6 * rng.normal(size=ROWS))
+        found = gm.diagnose(static_log(rng, drift), stated(gm.model_from_effects(["bias"])), hold_out=False)
+        assert found.verdict in ("named", "ambiguous")
+        assert "noise_markov" in found.credible_set
+        if found.verdict == "named":
+            assert [p.name for p in found.causes[0].parameters] == ["noise_markov", "noise_markov_time"]
 
 
 def test_a_stated_noise_level_is_held_against_the_data(rng: np.random.Generator) -> None:

@@ -72,6 +72,11 @@ noise:
 DEG_H = np.pi / 180 / 3600
 
 
+def noise(entry: str) -> str:
+    """A model file of noise alone: white, and one entry more."""
+    return f"effects: []\nnoise:\n  - {{effect: noise_white, value: 1 deg/sqrt(h)}}\n  - {entry}\n"
+
+
 def read(folder: Path, text: str | bytes) -> GyroModel:
     path = folder / "model.yaml"
     path.write_bytes(text.encode() if isinstance(text, str) else text)
@@ -160,6 +165,14 @@ def test_numbers_are_written_as_they_were_read(tmp_path: Path):
     assert values["bias_pressure"]["coefficient"] == "2 deg/h/mbar"
     assert values["scale_nonlinearity"]["coefficients"] == ["10 ppm", "1000 ppm"]
     assert document["noise"][0] == {"effect": "noise_white", "value": "0.1 deg/sqrt(h)"}
+
+
+def test_markov_noise_is_stated_with_its_time_constant(tmp_path: Path):
+    model = read(tmp_path, noise("{effect: noise_markov, value: 0.5 deg/h/sqrt(h), time_constant: 5 min}"))
+    write_model(model, tmp_path / "again.yaml")
+    written = yaml.safe_load((tmp_path / "again.yaml").read_text(encoding="utf-8"))["noise"]
+    assert written[1] == {"effect": "noise_markov", "value": "0.5 deg/h/sqrt(h)", "time_constant": "300 s"}
+    assert contents(read_model(tmp_path / "again.yaml")) == contents(model)
 
 
 floats = st.floats(allow_nan=False, allow_infinity=False, min_value=-1e200, max_value=1e200)
@@ -361,6 +374,14 @@ BAD = [
     ("effects: []\nnoise:\n  - {effect: noise_white, value: -1 deg/sqrt(h)}\n", 3, "cannot be negative"),
     ("effects: []\nnoise:\n  - {effect: noise_white, value: 1 deg/h}\n", 3, "not in deg/sqrt(h)"),
     ("effects: []\nnoise: {effect: noise_white, value: 1 deg/h}\n", 2, "noise as a list"),
+    (noise("{effect: noise_markov, value: 1 deg/h/sqrt(h)}"), 3, "needs a time_constant above zero"),
+    (noise("{effect: noise_flicker, value: 1 deg/h, time_constant: 3 s}"), 4, "noise_flicker has no time_constant"),
+    (
+        noise("{effect: noise_markov, value: 1 deg/h/sqrt(h), time_constant: 3 s}")
+        + "  - {effect: noise_flicker, value: 1 deg/h}\n",
+        3,
+        "cannot stand side by side",
+    ),
     (
         "effects: []\nnoise:\n  - {effect: noise_white, value: 1 deg/sqrt(h)}\n"
         "  - {effect: noise_white, value: 1 deg/sqrt(h)}\n",

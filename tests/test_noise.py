@@ -13,7 +13,14 @@ from scipy.stats import binom, norm
 from gyromodel.campaign import Campaign
 from gyromodel.estimate import fit_record, with_noise_intervals
 from gyromodel.model import model_from_effects
-from gyromodel.noise import NoiseRatios, coefficients, markov_sum, noise_grid, restricted_likelihood
+from gyromodel.noise import (
+    NoiseRatios,
+    coefficients,
+    markov_sum,
+    noise_grid,
+    restricted_likelihood,
+    stated_ratios,
+)
 from gyromodel.numerics.state_space import Sampling
 from gyromodel.signals import Record, read_signals
 from tests.test_state_space import covariance
@@ -73,6 +80,11 @@ def test_state_space_noise_has_the_allan_variances_of_the_table():
     assert found == pytest.approx(2 * np.log(2) / np.pi * B**2, rel=0.1)
 
 
+def markov(q: float, constant: float) -> NoiseRatios:
+    """Markov noise beside white noise of unit variance."""
+    return NoiseRatios(*(jnp.asarray(r) for r in (0.0, 0.0, q**2 * constant / 2, constant)))
+
+
 def design(rows: int) -> Design:
     index = np.arange(rows)
     return Design("static", STEP, index, {}, {}, {}, {}, (index, index))
@@ -91,6 +103,38 @@ def test_state_space_noise_has_the_allan_variances_of_the_independent_one():
         assert [allan_variance(own, m) for m in steps] == pytest.approx(expected, rel=close)
 
 
+def test_markov_noise_is_the_independent_one(rng: np.random.Generator):
+    q, constant = 10.0 ** rng.uniform(-2, 2), STEP * 10.0 ** rng.uniform(0.5, 1.5)
+    other = truth.Noise("markov", 0.0, markov=(q, constant)).covariance(design(ROWS))
+    own = covariance(markov_sum(markov(q, constant), STEP, constant), sampling(ROWS, STEP)) - np.eye(ROWS)
+    np.testing.assert_allclose(own, other, rtol=1e-9, atol=1e-9 * other[0, 0])
+
+
+def test_stated_coefficients_are_the_ratios_they_came_from(rng: np.random.Generator):
+    for ratios in (NoiseRatios(*(jnp.asarray(10.0 ** rng.uniform(-3, 1)) for _ in range(2))), markov(0.3, 70.0)):
+        again = stated_ratios(coefficients(ratios, 4.0, STEP), STEP)
+        assert [float(r) for r in again] == pytest.approx([float(r) for r in ratios], rel=1e-9)
+
+
+def test_strong_markov_noise_is_found_with_its_size_and_time(rng: np.random.Generator):
+    """White noise that a process of 20 to 40 samples exceeds 14-fold at its time constant, in 3072 samples."""
+    rows, model, N = 3072, model_from_effects(["bias"]), 1e-6
+    laid = with_rows(rows)
+    found, inside = 0, []
+    for _ in range(8):
+        constant = STEP * rng.uniform(20.0, 40.0)
+        q = 20.0 * N / constant
+        output = truth.white(rows, STEP, N, rng) + truth.markov(rows, STEP, q, constant, rng)
+        estimate = fit_record(with_output(laid, output), model)
+        found += "noise_markov" in estimate.model.noise
+        if "noise_markov" in estimate.model.noise:
+            spans = with_noise_intervals(estimate).noise_interval
+            truths = {"noise_markov": q, "noise_markov_time": constant, "noise_white": N}
+            inside += [spans[name][0] <= value <= spans[name][1] for name, value in truths.items()]
+    assert binom.cdf(found, 8, 0.9) > RARE
+    assert binom.cdf(sum(inside), len(inside), 0.95) > RARE
+
+
 def test_coefficients_are_input_rates():
     """One sample of variance 4 (rad/s)² each 25 s; ratios 0.09 and 0.01."""
     found = coefficients(NoiseRatios(np.asarray(0.09), np.asarray(0.01)), 4.0, 25.0)
@@ -101,7 +145,7 @@ def test_coefficients_are_input_rates():
 def test_noise_cells_reach_from_invisible_to_dominant(samples: int):
     grid = noise_grid(samples, 0.5, 0.5 * samples)
     prior = np.exp(grid.log_prior)
-    flicker, walk = (np.asarray(r) for r in grid.ratios)
+    flicker, walk = (np.asarray(r) for r in grid.ratios[:2])
     assert prior.sum() == pytest.approx(1.0)
     assert prior[flicker == 0].sum() == pytest.approx(0.5)
     assert prior[walk == 0].sum() == pytest.approx(0.5)
@@ -153,15 +197,14 @@ def with_output(record: Record, values: np.ndarray) -> Record:
     return record._replace(signals=record.signals | {"output": jnp.asarray(values)})
 
 
-def static(rng: np.random.Generator) -> Record:
-    units = {"time": "s", "output": "rad/s"}
-    columns = {"time": np.arange(ROWS) * STEP, "output": rng.standard_normal(ROWS)}
-    return read_signals(Campaign(columns, units, {"kind": "rate"}))
+def with_rows(rows: int) -> Record:
+    columns = {"time": np.arange(rows) * STEP, "output": np.arange(rows) % 2.0}
+    return read_signals(Campaign(columns, {"time": "s", "output": "rad/s"}, {"kind": "rate"}))
 
 
 def test_intervals_cover_independently_simulated_noise(rng: np.random.Generator):
     """N, B and K of white, flicker, random walk and both, levels as in a real gyro: 95 % by the binomial law."""
-    record, model = static(rng), model_from_effects(["bias"])
+    record, model = with_rows(ROWS), model_from_effects(["bias"])
     ids = {"noise_white": None, "noise_flicker": 1.0, "noise_random_walk": 2.0}
     inside: dict[str, list[bool]] = defaultdict(list)
     ratio: dict[str, list[float]] = defaultdict(list)
@@ -188,7 +231,7 @@ def test_intervals_cover_independently_simulated_noise(rng: np.random.Generator)
 
 def test_white_noise_shows_no_other(rng: np.random.Generator):
     """The interval of what is absent begins at zero and ends below what a record of this length would show."""
-    record, model = static(rng), model_from_effects(["bias"])
+    record, model = with_rows(ROWS), model_from_effects(["bias"])
     N = 1e-6
     shown = 0
     for _ in range(12):
@@ -206,7 +249,7 @@ def test_white_noise_shows_no_other(rng: np.random.Generator):
 @pytest.mark.parametrize(("kind", "other"), [("flicker", "noise_random_walk"), ("random_walk", "noise_flicker")])
 def test_strong_noise_is_told_by_its_colour(kind: str, other: str, rng: np.random.Generator):
     """One hundred times the white variance at the record's length."""
-    record, model = static(rng), model_from_effects(["bias"])
+    record, model = with_rows(ROWS), model_from_effects(["bias"])
     N, share = 1e-6, []
     for _ in range(8):
         coloured = truth.flicker(ROWS, STEP, 2 * N / np.sqrt(STEP), rng)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ import numpy as np
 from gyromodel.diagnosis._bank import Bank
 from gyromodel.diagnosis._lines import LineGrid
 from gyromodel.estimate import make_filter, whiten_columns
-from gyromodel.noise import NoiseGrid, NoiseRatios
+from gyromodel.noise import NoiseGrid
 from gyromodel.numerics.state_space import (
     Filter,
     Sampling,
@@ -84,7 +85,7 @@ class Cells:
     def prepare(self, cells: Sequence[int], each: Callable[..., Iterable]) -> None:
         """Prepare those cells that are not yet; `each` is `map` or a pool's."""
         cells = [g for g in cells if g not in self._cells]
-        groups = [cells[i : i + CELLS_TOGETHER] for i in range(0, len(cells), CELLS_TOGETHER)]
+        groups = self._alike(cells, CELLS_TOGETHER)
         made = [cell for group in each(self._filters, groups) for cell in group]
         for g, cell in zip(cells, each(self._with_energies, made), strict=True):
             self._cells[g] = cell
@@ -92,8 +93,8 @@ class Cells:
     def _filters(self, cells: Sequence[int]) -> list[Cell]:
         """Cells without their candidates' energies."""
         index = np.resize(cells, CELLS_TOGETHER)
-        ratios = NoiseRatios(*(np.asarray(r)[index] for r in self._grid.ratios))
-        filter = make_filter(ratios, self._grid.interval, self._grid.span, self._sampling)
+        ratios = self._grid.ratios.take(index)
+        filter = make_filter(ratios, self._grid.interval, ratios.longest(self._grid.span)[0], self._sampling)
         step, pulse = (np.asarray(e) for e in _energies(filter))
         gain, scale = np.asarray(filter.gain), np.asarray(filter.scale)
         log_determinant = np.asarray(filter.log_determinant)
@@ -130,11 +131,18 @@ class Cells:
         padded = jnp.pad(columns, ((0, 0), (0, -columns.shape[1] % COLUMN_STEP)))
         return np.asarray(whiten_columns(self[g].filter, padded))[:, : columns.shape[1]]
 
-    @staticmethod
-    def groups(cells: Sequence[int], columns: int) -> list[Sequence[int]]:
+    def groups(self, cells: Sequence[int], columns: int) -> list[Sequence[int]]:
         """Cells as `inner_products` takes them for data of so many columns."""
-        together = CELLS_TOGETHER if columns <= FEW_COLUMNS else 1
-        return [cells[i : i + together] for i in range(0, len(cells), together)]
+        return self._alike(cells, CELLS_TOGETHER if columns <= FEW_COLUMNS else 1)
+
+    def _alike(self, cells: Sequence[int], together: int) -> list[Sequence[int]]:
+        """Groups of cells of one longest time constant."""
+        longest = np.broadcast_to(self._grid.ratios.longest(self._grid.span), len(self._grid.log_prior))
+        groups: list[Sequence[int]] = []
+        for _, alike in groupby(cells, lambda g: longest[g]):
+            same = list(alike)
+            groups += [same[i : i + together] for i in range(0, len(same), together)]
+        return groups
 
     def inner_products(self, group: Sequence[int], data: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Per cell of a group, V⁻¹x of the data's columns and its inner products with the candidates' columns."""

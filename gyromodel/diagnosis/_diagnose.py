@@ -6,7 +6,6 @@ import contextlib
 from collections.abc import Sequence
 from typing import Literal
 
-import jax.numpy as jnp
 import numpy as np
 
 from gyromodel.averages import average, followed
@@ -209,9 +208,8 @@ def _grid(record: Record, baseline: Estimate) -> NoiseGrid:
     grid = noise_grid(int(record.present.sum()), record.interval, record_span(record))
     if not baseline.noise_given:
         return grid
-    ratios = NoiseRatios(
-        *(jnp.concatenate([jnp.atleast_1d(a), b]) for a, b in zip(baseline.ratios, grid.ratios, strict=True))
-    )
+    each = np.broadcast_arrays(*grid.ratios)
+    ratios = NoiseRatios(*(np.append(float(a), b) for a, b in zip(baseline.ratios, each, strict=True)))
     return grid._replace(ratios=ratios, log_prior=np.concatenate([[0.0], grid.log_prior]))
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from gyromodel._checks import thermometers
@@ -15,10 +17,13 @@ from gyromodel.effects._base import evaluate
 from gyromodel.effects.drivers import BiasColumn, BiasPeriodic
 from gyromodel.estimate import Estimate
 from gyromodel.model import GyroModel, effect_class
+from gyromodel.noise import markov_cells, restricted_likelihood
 
 # Cells within this many nats of the best, for any candidate that matters, get their neighbours searched too: those
 # better than nothing added and not hopelessly behind the best.
 NEARBY, HOPELESS = 7.0, 30.0
+# Prior odds (ln) of a Markov process against flicker and random walk of all sizes, absent ones too.
+MARKOV_PRIOR = np.log(0.2)
 # Candidates whose sums of squares differ by less than this part of the noise variance have the same signal.
 ALIKE = 0.2
 
@@ -34,6 +39,7 @@ class Ranking:
     slow: dict[int, bool] = field(repr=False)
     walks: dict[int, bool] = field(repr=False)
     baseline_columns: np.ndarray = field(repr=False)
+    residual: np.ndarray = field(repr=False)
     samples: int
     tangents: dict[str, Tangent] = field(default_factory=dict, repr=False)
 
@@ -141,6 +147,9 @@ def rank(
     # Noise beyond the statement must beat all noise within it: less than stated lacks nothing.
     within = np.array([everything[g].log_likelihood for g in families.pop("", [])])
     within_stated = max(null, log_sum(within) - np.log(len(within))) if len(within) else null
+    if estimate.noise_given and not float(estimate.ratios.flicker) and not float(estimate.ratios.markov):
+        each = _of_markov(scanner, estimate.ratios.walk, columns, residual)
+        statistic |= {"noise_markov": log_sum(each) - within_stated} if len(each) else {}
     for name, family in families.items():
         # More of it than stated, whatever the white noise turns out to be beside it.
         kind = scanner.grid.ratios.flicker if name == "noise_flicker" else scanner.grid.ratios.walk
@@ -153,7 +162,21 @@ def rank(
     walk, flicker = scanner.grid.ratios.walk, scanner.grid.ratios.flicker
     slow = {g: float(walk[g]) > 0 or float(flicker[g]) > 0 for g in cells}
     walks = {g: float(walk[g]) > 0 for g in cells}
-    return Ranking(statistic, posterior, results, prior, slow, walks, columns, scanner.degrees_of_freedom, continued)
+    return Ranking(
+        statistic, posterior, results, prior, slow, walks, columns, residual, scanner.degrees_of_freedom, continued
+    )
+
+
+def _of_markov(scanner: Scanner, walk: Any, columns: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Log likelihood of each cell of Markov noise beside white noise and a given walk, its prior weight in it."""
+    grid = scanner.grid
+    cells = markov_cells(scanner.degrees_of_freedom, grid.interval, grid.span)
+    if not len(cells.markov):
+        return np.zeros(0)
+    cells = cells._replace(walk=cells.walk + float(walk))
+    data = scanner.record.sampling, jnp.asarray(columns), jnp.asarray(residual)
+    result = restricted_likelihood(cells, grid.interval, grid.span, *data)
+    return result.log_likelihood + MARKOV_PRIOR - np.log(len(cells.markov))
 
 
 def tangents(scanner: Scanner, model: GyroModel, skip: set[str]) -> dict[str, Tangent]:
@@ -193,14 +216,15 @@ def cells_of_weight(ranking: Ranking, nats: float) -> list[int]:
 
 def noise_kinds(scanner: Scanner, ranking: Ranking) -> dict[str, float]:
     """Posterior over what the noise is made of with nothing more added, the likeliest first."""
-    weight: dict[str, float] = {}
-    logs = {g: r.log_likelihood + ranking.log_prior[g] for g, r in ranking.results.items()}
-    total = log_sum(list(logs.values()))
-    flicker, walk = scanner.grid.ratios
-    for g, v in logs.items():
+    logs: dict[str, list[float]] = {}
+    flicker, walk = scanner.grid.ratios.flicker, scanner.grid.ratios.walk
+    for g, r in ranking.results.items():
         parts = (("noise_white", True), ("noise_flicker", flicker[g] > 0), ("noise_random_walk", walk[g] > 0))
         kind = " + ".join(name for name, there in parts if there)
-        weight[kind] = weight.get(kind, 0.0) + float(np.exp(v - total))
+        logs.setdefault(kind, []).append(r.log_likelihood + ranking.log_prior[g])
+    logs["noise_white + noise_markov"] = list(_of_markov(scanner, 0.0, ranking.baseline_columns, ranking.residual))
+    total = log_sum([v for of_kind in logs.values() for v in of_kind])
+    weight = {kind: float(np.exp(log_sum(v) - total)) for kind, v in logs.items() if v}
     return dict(sorted(weight.items(), key=lambda item: -item[1]))
 
 

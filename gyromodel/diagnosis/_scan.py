@@ -157,7 +157,7 @@ class Scanner:
         """
         if not self.stated:
             return {}
-        flicker, walk = (np.asarray(r) for r in self.grid.ratios)
+        flicker, walk = (np.asarray(r) for r in self.grid.ratios[:2])
         more_flicker, more_walk = flicker > 1.5 * flicker[0], walk > 1.5 * walk[0]
         families = {
             "": ~more_flicker & ~more_walk,
@@ -167,7 +167,7 @@ class Scanner:
         return {name: [int(g) for g in np.flatnonzero(f)] for name, f in families.items() if f.any()}
 
     def _levels(self) -> tuple[np.ndarray, np.ndarray]:
-        flicker, walk = (np.unique(np.asarray(r), return_inverse=True)[1] for r in self.grid.ratios)
+        flicker, walk = (np.unique(np.asarray(r), return_inverse=True)[1] for r in self.grid.ratios[:2])
         return flicker, walk
 
     def coarse_cells(self) -> list[int]:

@@ -293,9 +293,10 @@ def refit(record: Record, baseline: Estimate, found: list[Found], noise: NoisePa
     rows = [r for f in found for r in f.rows]
     data = record.without(np.array(rows)) if rows else record
     model = GyroModel(model.effects, baseline.model.noise if given else {}, model.fixed, model.gyro)
+    freed = [f.name for f in found if f.frees_noise]
     for attempt in (model, _shapes_held(model, found)):
         try:
-            return fit_record(data, attempt, ratios=ratios)
+            return fit_record(data, attempt, ratios=ratios, markov="noise_markov" in freed if freed else None)
         except EstimateError:
             continue
     return None

@@ -217,7 +217,10 @@ def _next_test(names: list[str], record: Record, cause: Cause) -> str:
     if any(n.startswith("noise_") for n in names) and not all(n.startswith("noise_") for n in names):
         return "Repeat the run: a deterministic change comes back the same, noise does not."
     if all(n.startswith("noise_") for n in names):
-        return "A longer record at rest: flicker levels off in the Allan deviation, a random walk goes on rising."
+        return (
+            "A longer record at rest: in the Allan deviation flicker levels off, a random walk goes on rising and a "
+            "Markov process falls again."
+        )
     tests = [effect_class(n).test for n in names if n != "outliers" and not n.startswith("noise_")]
     return " ".join(dict.fromkeys(tests))
 
@@ -235,11 +238,13 @@ def _cause(
 ) -> Cause:
     name = step.name
     if step.frees_noise:
-        row = estimate.noise_table()[name]
-        value, low, high = (float(row[k]) for k in ("value", "lo", "hi"))
-        size = ParameterValue(name, value, (high - low) / 3.92, str(row["unit"]))
+        sizes = tuple(
+            ParameterValue(part, float(row["value"]), (float(row["hi"]) - float(row["lo"])) / 3.92, str(row["unit"]))
+            for part, row in estimate.noise_table().items()
+            if part.startswith(name)
+        )
         p = float(np.exp(-max(statistic, 0.0)))
-        return Cause(name, (size,), statistic, p, min(1.0, p * trials), members.get(name, 0.0))
+        return Cause(name, sizes, statistic, p, min(1.0, p * trials), members.get(name, 0.0))
     g = ranking.best_cell(name)
     result = ranking.results[g]
     _, explained, q = result.best[name]

@@ -15,7 +15,15 @@ from gyromodel.campaign import Campaign
 from gyromodel.estimate._estimate import Estimate, EstimateError, noise_coefficients
 from gyromodel.estimate._optimistix import optimistix_solution
 from gyromodel.model import GyroModel, ModelError, check_units, record_span
-from gyromodel.noise import NoiseRatios, from_grams, markov_sum, noise_grid, restricted_likelihood
+from gyromodel.noise import (
+    NoiseRatios,
+    from_grams,
+    markov_cells,
+    markov_sum,
+    noise_grid,
+    restricted_likelihood,
+    stated_ratios,
+)
 from gyromodel.numerics.least_squares import Normal, Solution, levenberg_marquardt
 from gyromodel.numerics.state_space import Filter, build_filter, colour, whiten, whitened_gram
 from gyromodel.numerics.uncertain import Source
@@ -29,6 +37,10 @@ Progress = Callable[[str, float], None] | None
 TOLERANCE = 1e-8
 # Relative size of a singular value of the whitened, column-scaled Jacobian below which a direction is not determined.
 SINGULAR = 1e-7
+# Factors (ln) on either side of the best noise ratios, tried one after the other: after the grid, and in later turns.
+COARSE_STEPS, FINE_STEPS = (0.8, 0.4, 0.2, 0.1), (0.7, 0.35, 0.17)
+# Noise is a Markov process rather than flicker and walk if it is so much likelier (nats).
+MARKOV_LEAD = 5.0
 # Levels of each noise ratio over its likely range, for the intervals of the noise coefficients.
 INTERVAL_LEVELS = 16
 # Half the 95 % point of chi-squared with one degree of freedom.
@@ -48,7 +60,8 @@ def fit(
     Args:
         campaigns: measured data of one unit; of a multi-position test that numbers no positions, the static poses, and
             where the reference rate comes from an attitude, means over 0.2 s.
-        model: what to fit; `noise` empty estimates white noise, flicker and random walk alongside.
+        model: what to fit; `noise` empty estimates white noise and flicker and random walk, or a Markov process,
+            alongside.
         solver: the package's own solver, or optimistix's.
         progress: called with a line and the fraction done.
         name: what these data are called where their part in a later result's uncertainty is told.
@@ -73,6 +86,7 @@ def fit_record(
     model: GyroModel,
     *,
     ratios: NoiseRatios | None = None,
+    markov: bool | None = None,
     solver: Solver = "levenberg_marquardt",
     ordinary: bool = False,
 ) -> Estimate:
@@ -82,6 +96,7 @@ def fit_record(
         record: the data.
         model: what to fit.
         ratios: noise ratios to hold instead of estimating them.
+        markov: whether the noise beside white is a Markov process, or flicker and walk; none: the likelier.
         solver: see `fit`.
         ordinary: weigh all samples alike in the parameters (the noise is still estimated, and so is the covariance that
             ordinary least squares has under it): less efficient where the noise model is right, safer where it is not.
@@ -102,7 +117,8 @@ def fit_record(
     solution = solve(model, np.asarray(model.vector()), record, filter, solver)
     for turn in range(0 if given is not None else 4):
         before = ratios
-        ratios = best_ratios(record, model.with_vector(jnp.asarray(solution.x)), coarse=turn == 0, start=before)
+        now = model.with_vector(jnp.asarray(solution.x))
+        ratios = best_ratios(record, now, coarse=turn == 0, start=before, markov=markov)
         filter = filter_of(record, ratios)
         solution = solve(model, solution.x, record, filter, solver)
         if turn and _close(before, ratios):
@@ -131,25 +147,22 @@ def given_ratios(record: Record, model: GyroModel) -> NoiseRatios | None:
     """Noise ratios of a model that states its noise; None where it is to be estimated."""
     if not model.noise:
         return None
-    white = float(model.noise.get("noise_white", 0.0))
-    if white <= 0:
-        raise ModelError("a model that states its noise needs a noise_white above zero")
-    variance = white**2 / record.interval
-    flicker = model.noise.get("noise_flicker", 0.0) ** 2 / variance
-    walk = model.noise.get("noise_random_walk", 0.0) ** 2 * record.interval / variance
-    return NoiseRatios(jnp.asarray(flicker), jnp.asarray(walk))
+    try:
+        return stated_ratios(model.noise, record.interval)
+    except ValueError as problem:
+        raise ModelError(str(problem)) from None
 
 
 @jax.jit
-def make_filter(ratios: NoiseRatios, interval, span, sampling) -> Filter:
-    """The whitening filter of one noise cell."""
-    return build_filter(markov_sum(ratios, interval, span), sampling)
+def make_filter(ratios: NoiseRatios, interval, longest, sampling) -> Filter:
+    """The whitening filter of noise cells of one longest time constant."""
+    return build_filter(markov_sum(ratios, interval, longest), sampling)
 
 
 def filter_of(record: Record, ratios: NoiseRatios) -> Filter:
     """The whitening filter of one noise cell on a record."""
     ratios = NoiseRatios(*(jnp.asarray(r) for r in ratios))
-    return make_filter(ratios, record.interval, record_span(record), record.sampling)
+    return make_filter(ratios, record.interval, float(ratios.longest(record_span(record))), record.sampling)
 
 
 whiten_columns = jax.jit(whiten)
@@ -160,12 +173,13 @@ _gram = jax.jit(whitened_gram)
 
 def solve(model: GyroModel, x: np.ndarray, record: Record, filter: Filter, solver: Solver) -> Solution:
     """Minimise the whitened sum of squares; optimistix takes over where the own solver does not converge."""
-    output = record.signals["output"]
+    output, present = np.asarray(record.signals["output"]), np.asarray(filter.present)
+    steady = model.steady_columns(record.signals)
 
     def normal(v: np.ndarray) -> Normal:
-        predicted, jacobian = model.with_vector(jnp.asarray(v)).linearise(record.signals)
-        residual = jnp.where(filter.present, predicted - output, 0.0)
-        gram = np.asarray(_gram(filter, pad_columns(jnp.column_stack([jacobian, residual]))))
+        predicted, jacobian = model.with_vector(v).linearise(record.signals, steady)
+        residual = np.where(present, predicted - output, 0.0)
+        gram = np.asarray(_gram(filter, pad_columns(np.column_stack([jacobian, residual]))))
         p = len(v)
         return gram[:p, :p], gram[:p, p], float(gram[p, p])
 
@@ -180,11 +194,16 @@ def solve(model: GyroModel, x: np.ndarray, record: Record, filter: Filter, solve
 
 def pad_columns(columns, step: int = 8):
     """Zero columns up to a multiple of `step`, so that compiled shapes recur."""
-    return jnp.pad(columns, ((0, 0), (0, -columns.shape[1] % step)))
+    return np.pad(columns, ((0, 0), (0, -columns.shape[1] % step)))
 
 
-def best_ratios(record: Record, model: GyroModel, *, coarse: bool, start: NoiseRatios) -> NoiseRatios:
-    """Flicker and walk of greatest restricted likelihood: the grid, then ever finer squares around the best cell."""
+def best_ratios(
+    record: Record, model: GyroModel, *, coarse: bool, start: NoiseRatios, markov: bool | None
+) -> NoiseRatios:
+    """The noise of greatest restricted likelihood: the grids, then ever finer squares around the best cell.
+
+    It is flicker and walk, unless a Markov process beside white noise is likelier by a margin.
+    """
     predicted, jacobian = model.linearise(record.signals)
     residual = jnp.where(record.sampling.present, record.signals["output"] - predicted, 0.0)
     span = record_span(record)
@@ -199,13 +218,30 @@ def best_ratios(record: Record, model: GyroModel, *, coarse: bool, start: NoiseR
         # Every other level, then the levels around the best of them.
         levels = [np.unique(r) for r in grid.ratios]
         first = _mesh(level[::2] for level in levels)
-        best = _at(first, int(np.argmax(likelihood(first))))
+        best = first.take(int(np.argmax(likelihood(first))))
         near = _mesh(_around(level, float(r)) for level, r in zip(levels, best, strict=True))
-        best = _at(near, int(np.argmax(likelihood(near))))
-    for width in (0.8, 0.4, 0.2, 0.1) if coarse else (0.7, 0.35, 0.17):
-        cells = _mesh(np.unique(np.asarray(r) * np.exp(width * np.array([-1.0, 0.0, 1.0]))) for r in best)
-        best = _at(cells, int(np.argmax(likelihood(cells))))
-    return best
+        best = near.take(int(np.argmax(likelihood(near))))
+    best, top = _refined(likelihood, best, COARSE_STEPS if coarse else FINE_STEPS)
+    if not coarse or markov is False:
+        return best
+    cells = markov_cells(int(record.present.sum()), record.interval, span)
+    if not len(cells.flicker):
+        return best
+    other = cells.take(int(np.argmax(likelihood(cells))))
+    other, likeliest = _refined(likelihood, other, COARSE_STEPS)
+    return other if markov or likeliest > top + MARKOV_LEAD else best
+
+
+def _refined(
+    likelihood: Callable[[NoiseRatios], np.ndarray], best: NoiseRatios, steps: Sequence[float]
+) -> tuple[NoiseRatios, float]:
+    """The likeliest cell around one, and its log likelihood."""
+    top = -np.inf
+    for width in steps:
+        cells = _mesh(np.asarray(r) * np.exp(width * np.array([-1.0, 0.0, 1.0])) for r in best)
+        each = likelihood(cells)
+        best, top = cells.take(int(np.argmax(each))), float(each.max())
+    return best, top
 
 
 def _around(levels: np.ndarray, level: float) -> np.ndarray:
@@ -214,12 +250,8 @@ def _around(levels: np.ndarray, level: float) -> np.ndarray:
 
 
 def _mesh(levels: Iterable[np.ndarray]) -> NoiseRatios:
-    """Cells at every pair of levels of flicker and walk."""
-    return NoiseRatios(*(v.ravel() for v in np.meshgrid(*levels, indexing="ij")))
-
-
-def _at(ratios: NoiseRatios, i: int) -> NoiseRatios:
-    return NoiseRatios(ratios.flicker[i], ratios.walk[i])
+    """Cells at every combination of levels."""
+    return NoiseRatios(*(v.ravel() for v in np.meshgrid(*map(np.unique, levels), indexing="ij")))
 
 
 def _close(a: NoiseRatios, b: NoiseRatios) -> bool:
@@ -253,20 +285,20 @@ def _finish(
     if ordinary:
         covariance = _ordinary_covariance(record, filter, jacobian, model)
     nu = len(w) - p
-    variance = float(w[:, p] @ w[:, p]) / nu if variance is None else variance
+    white = float(w[:, p] @ w[:, p]) / nu if variance is None else variance
     likelihood = from_grams(np.atleast_1d(filter.log_determinant), (w.T @ w)[None], len(w)).log_likelihood[0]
-    noise = dict(model.noise) or noise_coefficients(ratios, variance, record, float(model.gain()))
+    noise = dict(model.noise) or noise_coefficients(ratios, white, record, float(model.gain()))
     rows = record.rows
     whitened = np.full(rows, np.nan)
-    whitened[record.present] = w[:, p] / np.sqrt(variance)
+    whitened[record.present] = w[:, p] / np.sqrt(white)
     return Estimate(
         model=GyroModel(model.effects, noise, model.fixed, model.gyro),
-        covariance=covariance * variance,
+        covariance=covariance * white,
         degrees_of_freedom=nu,
         residual=np.where(record.present, np.asarray(residual)[:rows], np.nan),
         whitened=whitened,
         ratios=ratios,
-        white_variance=variance,
+        white_variance=white,
         log_likelihood=float(likelihood),
         iterations=int(solution.iterations),
         record=record,
@@ -331,7 +363,10 @@ def with_noise_intervals(estimate: Estimate) -> Estimate:
     predicted, jacobian = estimate.model.linearise(record.signals)
     residual = jnp.where(record.sampling.present, record.signals["output"] - predicted, 0.0)
     span = record_span(record)
-    grid = noise_grid(int(record.present.sum()), record.interval, span).ratios
+    samples = int(record.present.sum())
+    grid = noise_grid(samples, record.interval, span).ratios
+    if float(estimate.ratios.markov) > 0:
+        grid = markov_cells(samples, record.interval, span)
     cells = _mesh(
         np.union1d(r, float(b) * np.array([0.2, 1.0, 5.0])) for r, b in zip(grid, estimate.ratios, strict=True)
     )
@@ -341,9 +376,9 @@ def with_noise_intervals(estimate: Estimate) -> Estimate:
         kept = below < REJECTED
         if not margin or kept.sum() > 2 * INTERVAL_LEVELS:
             break
-        cells = _mesh(_levels(np.asarray(ratio), below < margin * REJECTED) for ratio in cells)
+        cells = _mesh(_levels(np.asarray(ratio), below < margin * REJECTED) for ratio in np.broadcast_arrays(*cells))
     white = result.residual_sum[kept] / result.degrees_of_freedom
-    ratios = NoiseRatios(cells.flicker[kept], cells.walk[kept])
+    ratios = cells.take(kept)
     spans = {k: (float(v.min()), float(v.max())) for k, v in noise_coefficients(ratios, white, record, gain).items()}
     low, high = spans["noise_white"]
     scatter = 1.96 / float(np.sqrt(2 * (record.present.sum() - 1)))

@@ -1,12 +1,26 @@
-"""Noise: part of a model (white, flicker, random walk), deviations over averaging time, kinds and sizes in a record."""
+"""Noise: part of a model (white, flicker or Markov, random walk), deviations over averaging time, kinds and sizes in
+a record.
+"""
 
 from gyromodel.noise._deviation import Deviation, Estimator, deviation, with_gaps
 from gyromodel.noise._identify import IdentifiedNoise, Line, identify_noise
 from gyromodel.noise._likelihood import CellFit, from_grams, restricted_likelihood
-from gyromodel.noise._model import NOISE_UNITS, NoiseGrid, NoiseRatios, coefficients, markov_sum, noise_grid
+from gyromodel.noise._model import (
+    MARKOV_TIME,
+    NOISE_UNITS,
+    NoiseGrid,
+    NoiseRatios,
+    check_stated,
+    coefficients,
+    markov_cells,
+    markov_sum,
+    noise_grid,
+    stated_ratios,
+)
 from gyromodel.noise._terms import NoiseTerm
 
 __all__ = [
+    "MARKOV_TIME",
     "NOISE_UNITS",
     "CellFit",
     "Deviation",
@@ -16,12 +30,15 @@ __all__ = [
     "NoiseGrid",
     "NoiseRatios",
     "NoiseTerm",
+    "check_stated",
     "coefficients",
     "deviation",
     "from_grams",
     "identify_noise",
+    "markov_cells",
     "markov_sum",
     "noise_grid",
     "restricted_likelihood",
+    "stated_ratios",
     "with_gaps",
 ]

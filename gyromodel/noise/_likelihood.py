@@ -28,8 +28,8 @@ class CellFit(NamedTuple):
 
 
 @jax.jit
-def _grams(ratios: NoiseRatios, interval, span, sampling: Sampling, columns):
-    logs, grams = log_determinant_and_gram(markov_sum(ratios, interval, span), sampling, columns)
+def _grams(ratios: NoiseRatios, interval, longest, sampling: Sampling, columns):
+    logs, grams = log_determinant_and_gram(markov_sum(ratios, interval, longest), sampling, columns)
     return logs, jnp.moveaxis(grams, -1, 0)
 
 
@@ -39,22 +39,26 @@ def gram_by_cell(
     """ln |V| and Xᵀ V⁻¹ X of every cell, cells in groups of a fixed size and columns padded, so that shapes recur."""
     width = -(-columns.shape[1] // COLUMN_STEP) * COLUMN_STEP
     padded = jnp.pad(columns, ((0, 0), (0, width - columns.shape[1])))
-    # In NumPy: JAX would compile the slicing for every number of cells.
-    flicker, walk = (np.asarray(r) for r in ratios)
-    parts, start = [], 0
-    while start < len(flicker):
-        size = CELLS_TOGETHER if len(flicker) - start > 2 * FEW_CELLS else FEW_CELLS
-        index = np.minimum(np.arange(start, start + size), len(flicker) - 1)
-        parts.append(NoiseRatios(flicker[index], walk[index]))
-        start += size
+    cells = len(ratios.flicker)
+    longest = np.broadcast_to(ratios.longest(span), cells)
+    parts = []
+    for reach in np.unique(longest):
+        here = np.flatnonzero(longest == reach)
+        while len(here):
+            size = CELLS_TOGETHER if len(here) > 2 * FEW_CELLS else FEW_CELLS
+            parts.append((reach, here[:size], np.resize(here[:size], size)))
+            here = here[size:]
+    logs, grams = np.zeros(cells), np.zeros((cells, columns.shape[1], columns.shape[1]))
 
-    def work(part: NoiseRatios) -> tuple[np.ndarray, np.ndarray]:
-        log, gram = _grams(part, interval, span, sampling, padded)
-        return np.asarray(log), np.asarray(gram)[:, : columns.shape[1], : columns.shape[1]]
+    def work(part: tuple[float, np.ndarray, np.ndarray]) -> None:
+        reach, here, padding = part
+        log, gram = _grams(ratios.take(padding), interval, reach, sampling, padded)
+        logs[here] = np.asarray(log)[: len(here)]
+        grams[here] = np.asarray(gram)[: len(here), : columns.shape[1], : columns.shape[1]]
 
     with ThreadPoolExecutor(THREADS) as pool:
-        logs, grams = zip(*pool.map(work, parts), strict=True)
-    return np.concatenate(logs)[: len(flicker)], np.concatenate(grams)[: len(flicker)]
+        list(pool.map(work, parts))
+    return logs, grams
 
 
 def restricted_likelihood(
@@ -62,8 +66,8 @@ def restricted_likelihood(
     interval: float,
     span: float,
     sampling: Sampling,
-    jacobian: Float[Array, "sample parameter"],
-    residual: Float[Array, " sample"],
+    jacobian: Float[Array | np.ndarray, "sample parameter"],
+    residual: Float[Array | np.ndarray, " sample"],
 ) -> CellFit:
     """−½ ln|V| − ½ ln|JᵀV⁻¹J| − (ν/2) ln RSS of every cell."""
     log_determinant, gram = gram_by_cell(ratios, interval, span, sampling, jnp.column_stack([jacobian, residual]))

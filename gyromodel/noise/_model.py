@@ -1,11 +1,12 @@
-"""White noise, flicker and random walk relative to the white variance.
+"""White noise, flicker, random walk and Markov noise relative to the white variance.
 
 Conventions, two-sided rate PSD and Allan variance: white N² and N²/τ, flicker B²/(2πf) and (2 ln2/π)B², random walk
-K²/(2πf)² and K²τ/3.
+K²/(2πf)² and K²τ/3, Markov (q T)²/(1 + (2πf T)²) with variance q²T/2.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -14,21 +15,44 @@ from jaxtyping import Array, Float
 
 from gyromodel.numerics.state_space import MarkovSum
 
-# Public noise ids and the units they are written in.
-NOISE_UNITS = {"noise_white": "deg/sqrt(h)", "noise_flicker": "deg/h", "noise_random_walk": "deg/h/sqrt(h)"}
+MARKOV_TIME = "noise_markov_time"
+# What a model can state of its noise, by public id, and the units it is written in.
+NOISE_UNITS = {
+    "noise_white": "deg/sqrt(h)",
+    "noise_flicker": "deg/h",
+    "noise_random_walk": "deg/h/sqrt(h)",
+    "noise_markov": "deg/h/sqrt(h)",
+    MARKOV_TIME: "s",
+}
 
 # Up to this many samples (averaged test points, say) noise is taken as white: they cannot show its colour.
 FEWEST_FOR_COLOUR = 40
 
 # Markov terms that make up flicker; their time constants span from one sample to the record.
 FLICKER_STATES = 6
+# Markov noise has time constants from so many samples to this part of a record, and so many levels at this ratio.
+SHORTEST, LONGEST = 3.0, 5.0
+MARKOV_LEVELS, MARKOV_STEP = 8, 4.0
 
 
 class NoiseRatios(NamedTuple):
-    """Flicker B² and random walk K²·(one sample interval), each over the white variance of a sample."""
+    """Flicker B², random walk K²·(one sample interval) and Markov q²T/2, each over the white variance of a sample.
+
+    A cell holds flicker or a Markov process of time constant T (s), never both.
+    """
 
     flicker: Float[Array | np.ndarray, "*cell"]
     walk: Float[Array | np.ndarray, "*cell"]
+    markov: Float[Array | np.ndarray, "*#cell"] = np.zeros(())
+    constant: Float[Array | np.ndarray, "*#cell"] = np.zeros(())
+
+    def take(self, index: int | np.ndarray) -> NoiseRatios:
+        """Some cells."""
+        return NoiseRatios(*(x[index] for x in np.broadcast_arrays(*self)))
+
+    def longest(self, span: float) -> np.ndarray:
+        """The longest time constant of each cell: the span of the record that flicker needs, or T."""
+        return np.where(np.asarray(self.markov) > 0, self.constant, span)
 
 
 class NoiseGrid(NamedTuple):
@@ -40,17 +64,17 @@ class NoiseGrid(NamedTuple):
     span: float
 
 
-def markov_sum(ratios: NoiseRatios, interval: float | Array, span: float | Array) -> MarkovSum:
-    """Noise cells as a sum of Markov processes: the random walk first, then flicker.
+def markov_sum(ratios: NoiseRatios, interval: float | Array, longest: float | Array) -> MarkovSum:
+    """Noise cells of one longest time constant as a sum of Markov processes: the random walk first, that one last.
 
     Markov terms of equal variance B² ln(ρ)/π whose time constants stand at ratio ρ add up to B²/(2πf).
     """
     steps = jnp.arange(FLICKER_STATES) / (FLICKER_STATES - 1)
-    constants = interval * (span / interval) ** steps
-    spacing = jnp.log(span / interval) / (FLICKER_STATES - 1)
+    constants = interval * (longest / interval) ** steps
+    spacing = jnp.log(longest / interval) / (FLICKER_STATES - 1)
     each = ratios.flicker * spacing / jnp.pi
     decay = jnp.concatenate([jnp.zeros(1), 1.0 / constants])
-    return MarkovSum(decay, jnp.stack([ratios.walk / interval, *[each] * FLICKER_STATES]))
+    return MarkovSum(decay, jnp.stack([ratios.walk / interval, *[each] * (FLICKER_STATES - 1), each + ratios.markov]))
 
 
 def noise_grid(samples: int, interval: float, span: float) -> NoiseGrid:
@@ -65,6 +89,19 @@ def noise_grid(samples: int, interval: float, span: float) -> NoiseGrid:
     return NoiseGrid(NoiseRatios(jnp.asarray(f), jnp.asarray(w)), np.log(prior), interval, max(span, 2 * interval))
 
 
+def markov_cells(samples: int, interval: float, span: float) -> NoiseRatios:
+    """Markov noise beside white, from time constants of a few samples to a part of the record, as `noise_grid`."""
+    if samples <= FEWEST_FOR_COLOUR:
+        none = np.zeros(0)
+        return NoiseRatios(none, none, none, none)
+    constants = np.geomspace(SHORTEST * interval, span / LONGEST, max(int(np.log(span / interval)), 2))
+    # At a time constant of so many samples, from half of the white variance that is left in their mean.
+    level = np.geomspace(0.5, 0.5 * MARKOV_STEP ** (MARKOV_LEVELS - 1), MARKOV_LEVELS)
+    markov = (level * interval / constants[:, None]).ravel()
+    none = np.zeros_like(markov)
+    return NoiseRatios(none, none, markov, np.repeat(constants, MARKOV_LEVELS))
+
+
 def _levels(samples: int, power: float) -> int:
     return int(np.ceil(power * np.log(samples) / np.log(5.0))) + 2
 
@@ -74,9 +111,38 @@ def _half_on_absent(count: int) -> np.ndarray:
 
 
 def coefficients(ratios: NoiseRatios, white_variance: Any, interval: float) -> dict[str, Any]:
-    """N, B, K as input rates (rad/s/√Hz, rad/s, rad/s/√s) from ratios and white variances of a sample."""
-    return {
-        "noise_white": np.sqrt(white_variance * interval),
+    """N, B, K as input rates (rad/s/√Hz, rad/s, rad/s/√s) from ratios and white variances of a sample.
+
+    Of cells with Markov noise N, q and T, in rad/s/√Hz, rad/s/√s and s.
+    """
+    white = {"noise_white": np.sqrt(white_variance * interval)}
+    markov, constant = np.asarray(ratios.markov), np.asarray(ratios.constant)
+    if np.any(markov > 0):
+        q = np.sqrt(2.0 * markov * white_variance / constant)
+        return white | {"noise_markov": q, MARKOV_TIME: constant}
+    return white | {
         "noise_flicker": np.sqrt(np.asarray(ratios.flicker) * white_variance),
         "noise_random_walk": np.sqrt(np.asarray(ratios.walk) * white_variance / interval),
     }
+
+
+def check_stated(noise: Mapping[str, Any]) -> None:
+    """Refuse (ValueError) a statement without white noise, or of Markov noise without its time or beside flicker."""
+    if float(noise.get("noise_white", 0.0)) <= 0:
+        raise ValueError("noise needs a noise_white above zero")
+    if float(noise.get("noise_markov", 0.0)):
+        if float(noise.get("noise_flicker", 0.0)):
+            raise ValueError("noise_flicker and noise_markov cannot stand side by side; state one of them")
+        if float(noise.get(MARKOV_TIME, 0.0)) <= 0:
+            raise ValueError("noise_markov needs a time_constant above zero")
+
+
+def stated_ratios(noise: Mapping[str, Any], interval: float) -> NoiseRatios:
+    """The cell of stated coefficients (internal units): the inverse of `coefficients`, after `check_stated`."""
+    check_stated(noise)
+    stated = {name: float(value) for name, value in noise.items()}
+    variance = stated["noise_white"] ** 2 / interval
+    flicker, walk = stated.get("noise_flicker", 0.0), stated.get("noise_random_walk", 0.0)
+    q, constant = stated.get("noise_markov", 0.0), stated.get(MARKOV_TIME, 0.0)
+    ratios = (flicker**2 / variance, walk**2 * interval / variance, q**2 * constant / 2.0 / variance, constant)
+    return NoiseRatios(*(jnp.asarray(r) for r in ratios))

@@ -97,7 +97,7 @@ def _filter_on(covariance, noise: MarkovSum, sampling: Sampling):
     return covariance, Filter(transition, gain, scale, sampling.present)
 
 
-def whiten(filter: Filter, columns: Float[Array, "sample column"]) -> Float[Array, "sample column *cell"]:
+def whiten(filter: Filter, columns: Float[Array | np.ndarray, "sample column"]) -> Float[Array, "sample column *cell"]:
     """L⁻¹ applied to columns; rows of missing samples come out zero."""
     return whiten_on(at_rest(filter, columns.shape[1]), filter, columns)[1]
 
@@ -156,7 +156,7 @@ def _in_parts(add, rows, carry):
 
 
 def whiten_on(
-    state: Float[Array, "state column *cell"], filter: Filter, columns: Float[Array, "sample column"]
+    state: Float[Array, "state column *cell"], filter: Filter, columns: Float[Array | np.ndarray, "sample column"]
 ) -> tuple[Float[Array, "state column *cell"], Float[Array, "sample column *cell"]]:
     """The state after some rows that follow on `state`, and these rows whitened."""
     cells = state.ndim - 2

@@ -52,6 +52,8 @@ PHRASES = {
     "noise_white": "white rate noise (angle random walk)",
     "noise_flicker": "flicker noise (bias instability)",
     "noise_random_walk": "a rate random walk",
+    "noise_markov": "Markov noise",
+    "noise_markov_time": "time constant of the Markov noise",
 }
 
 
