@@ -10,13 +10,14 @@ import pytest
 
 import gyromodel as gm
 from gyromodel.averages import average
+from gyromodel.diagnosis._isolation import settling_test
 from gyromodel.model import ModelError
 from gyromodel.model_files import read_model, write_model
 from gyromodel.signals import rate_output, read_signals
 
 ROWS = 240
 TIME = 10.0 * np.arange(ROWS)
-UNITS = {"segment": "", "time": "s", "temperature": "degC", "output": "deg/h", "rate": "deg/s"}
+UNITS = {"segment": "", "time": "s", "temperature": "degC", "output": "deg/h", "rate": "deg/s", "azimuth": "deg"}
 
 
 @pytest.fixture
@@ -179,3 +180,42 @@ def test_nothing_is_left_out_silently(seed: int, rng: np.random.Generator) -> No
     for column in "abcd":
         for name in (f"bias_{column}", f"smooth({column})"):
             assert name in found.searched or name in found.not_testable
+
+
+def late_thermometer(
+    rng: np.random.Generator, *, curve: float, lag: float, supply: float, rows: int = 240
+) -> gm.Campaign:
+    """A log at rest whose bias, straight or curved, follows the temperature ahead of the thermometer."""
+    time = np.arange(rows) * 60.0
+    temperature = 20 + 20 * np.sin(2 * np.pi * time / 5000) + 6 * np.sin(2 * np.pi * time / 2100)
+    ahead = temperature + lag * np.gradient(temperature, time) - 20.0
+    voltage = 5 + 0.2 * np.sign(np.sin(2 * np.pi * time / 3300))
+    output = 3 + 0.3 * ahead + curve * ahead**2 + supply * (voltage - 5) + 0.1 * rng.standard_normal(rows)
+    columns = {"time": time, "temperature": temperature, "supply_voltage": voltage, "output": output}
+    return campaign(columns.pop("output"), columns.pop("time"), **columns)
+
+
+def test_what_grew_from_another_effect_is_not_exchanged_for_it():
+    """A late thermometer beside another cause, an example with a fixed seed: left out, its bias curve goes with it."""
+    measured = late_thermometer(np.random.default_rng(1), curve=0.03, lag=150.0, supply=2.0)
+    found = gm.diagnose(measured, gm.model_from_effects(["bias"]), hold_out=False)
+    assert found.verdict == "named"
+    assert {cause.effect for cause in found.causes} == {"temperature_lag", "bias_supply_voltage"}
+    assert np.nanstd(found.residual_after) < 0.15
+
+
+def test_no_test_is_asked_for_where_none_can_help():
+    """Beside a straight bias over temperature a late thermometer is the Shupe effect, whatever is measured."""
+    measured = late_thermometer(np.random.default_rng(0), curve=0.0, lag=30.0, supply=0.0)
+    baseline = gm.model_from_effects(["bias", "bias_temperature"])
+    extended = gm.fit(measured, gm.model_from_effects(["bias", "bias_temperature", "bias_temperature_rate"]))
+    assert settling_test([measured], baseline, extended, ["bias_temperature_rate", "temperature_lag"]) is None
+
+
+def test_sizes_are_told_of_the_parameter_that_has_a_value():
+    """A magnetic bias over azimuth alone, without a measured field, is as large as the tilt that looks the same."""
+    azimuth = np.arange(ROWS) // 8 * 45.0 % 360
+    noise = np.random.default_rng(0).standard_normal(ROWS)
+    found = gm.diagnose(campaign(noise, azimuth=azimuth), gm.model_from_effects(["bias"]), hold_out=False)
+    magnetic, tilt = (found.minimum_detectable[name] for name in ("bias_magnetic", "table_tilt"))
+    assert magnetic == (pytest.approx(tilt[0], rel=0.5), "deg/h")

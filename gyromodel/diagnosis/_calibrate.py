@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from gyromodel import __version__
-from gyromodel.diagnosis._ranking import cells_of_weight, rank, skipped
+from gyromodel.diagnosis._ranking import cells_of_weight, rank, skipped, tangents
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.estimate import Estimate, filter_of
 from gyromodel.numerics.state_space import colour
@@ -44,6 +44,7 @@ def null_scores(
     if kept.exists():
         return np.load(kept)
     skip = skipped(baseline.model, scanner.record.signals)
+    continued = list(tangents(scanner, baseline.model, skip).values())
     cells = [0] if scanner.stated else scanner.only_cells
     if cells is None:
         cells = cells_of_weight(rank(scanner, scanner.coarse_cells(), baseline, (), skip), WITHIN)
@@ -53,7 +54,8 @@ def null_scores(
     scores = []
     for start in range(0, draws, DRAWS_TOGETHER):
         white = rng.standard_normal((DRAWS_TOGETHER, len(scanner.present)))
-        batches = scanner.run_many(cells, columns, np.asarray(_draw(filter, jax.numpy.asarray(white))).T, {})
+        drawn = np.asarray(_draw(filter, jax.numpy.asarray(white))).T
+        batches = scanner.run_many(cells, columns, drawn, {}, tangents=continued)
         logs = np.stack([b.log_likelihood for b in batches]) + prior
         names = set.intersection(*(set(b.evidence) for b in batches)) - skip
         each = [np.logaddexp.reduce(logs + np.stack([b.evidence[n] for b in batches])) for n in sorted(names)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -16,9 +16,10 @@ from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._evidence import SAFE_THRESHOLD, explained_for
 from gyromodel.diagnosis._ranking import skipped
 from gyromodel.effects import CATALOGUE, Effect, Signals
+from gyromodel.effects._base import evaluate
 from gyromodel.effects.drivers import BiasStep
 from gyromodel.estimate import Estimate, filter_of, given_ratios, whiten_columns
-from gyromodel.model import GyroModel, ModelError, make_effect, parameter_unit
+from gyromodel.model import GyroModel, ModelError, effect_class, make_effect, parameter_unit
 from gyromodel.noise import NoiseRatios
 from gyromodel.signals import Record, read_signals, with_columns_known
 from gyromodel.units import factor, internal_unit
@@ -139,12 +140,24 @@ def settling_test(
 
 
 def _at_size(view: View, fitted: GyroModel, names: Sequence[str]) -> list[Effect]:
-    """Each effect at the size it has if it is the cause: as fitted, or its form that explains most."""
+    """Each effect at the size it has if it is the cause: as fitted, or its form that explains most.
+
+    None that only continues what the view's model already takes whole.
+    """
     signals, found = view.record.signals, []
     residual = view.rest(np.asarray(signals["output"] - view.model.predict(signals))[:, None])[:, 0]
     for name in names:
         if name in fitted.labels:
             found.append(fitted.effects[fitted.labels.index(name)])
+            continue
+        grown = effect_class(name).continuing(view.model.effects)
+        if grown is not None:
+            column = np.asarray(evaluate(grown, signals)[1][:, -1:]) * float(view.model.gain())
+            left = view.rest(column)[:, 0]
+            if np.linalg.norm(left) > VANISHED * np.linalg.norm(column):
+                last = [k for k, declared in grown.declared().items() if not declared.linear][-1]
+                amount = np.clip(left @ residual / (left @ left), -grown.reach, grown.reach)
+                found.append(replace(grown, **{last: jnp.asarray(amount)}))
             continue
         tried = []
         forms = _forms(make_effect(name).prepared(signals), signals)
@@ -277,8 +290,7 @@ def _sizes(
 
     def size(name: str, distance: float) -> Size:
         effect = forms[name][0]
-        field = next(k for k, d in effect.declared().items() if d.linear)
-        unit = parameter_unit(effect, field, record.output_unit, record.units)
+        unit = parameter_unit(effect, effect.leading(), record.output_unit, record.units)
         if effect.site == "gain":
             return Size(distance / per_unit[name] / float(model.gain()) / factor("ppm", "1"), "ppm")
         return Size(distance / per_unit[name] * factor(internal_unit(unit), unit), unit)
@@ -299,8 +311,7 @@ def _sizes(
 
 def _per_unit(effects: Sequence[Effect], columns: Sequence[np.ndarray]) -> float:
     """Distance that a unit of an effect's first parameter makes, in the median of the forms where it makes any."""
-    field = next(k for k, d in effects[0].declared().items() if d.linear)
-    counts = [jnp.size(getattr(e, field)) for e in effects]
+    counts = [jnp.size(getattr(e, e.leading())) for e in effects]
     reach = [np.linalg.norm(c[:, :n], axis=0).max(initial=0.0) for c, n in zip(columns, counts, strict=True)]
     return float(np.median([r for r in reach if r > VANISHED * max(reach)]))
 

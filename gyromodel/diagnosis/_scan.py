@@ -92,6 +92,10 @@ def _tangents(batch: Batch, tangents: Sequence[Tangent], x: np.ndarray, z: np.nd
     if not first:
         return
     left = x[:, : first + p].T @ z
+    # In columns of length one: of a long and a short column of the baseline, neither may be left unprojected.
+    length = np.sqrt(np.maximum(np.diag(left[first:, first : first + p]), 1e-300))
+    left[first:] /= length[:, None]
+    left[:, first : first + p] /= length
     own, cross, data = left[:first, :first], left[:first, first : first + p], left[:, first + p :]
     inner = np.linalg.lstsq(left[first:, first : first + p], np.column_stack([cross.T, data[first:]]), rcond=1e-13)[0]
     energy = np.diag(own - cross @ inner[:, :first])

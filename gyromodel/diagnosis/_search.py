@@ -139,7 +139,12 @@ def search(
         return Selection(baseline, (), (), path[0].ranking, (baseline,), driver)
     found, left_out = standing(path), {}
     if sum(f.effect is not None for f in found) > 1:
+        before = found
         found, estimates[-1], left_out = _exchange(record, scanner, baseline, found, estimates[-1], threshold, noise)
+        if found != before:
+            ranking = rank_where_it_matters(scanner, estimates[-1], tuple(r for f in found for r in f.rows))
+            name, score = ranking.best(drivers=False, but=("bias_periodic",))
+            remains = remains or (str(name) if score >= threshold else "")
     driver = _significant_driver(ranking, threshold, scanner.runs)
     return Selection(estimates[-1], tuple(found), tuple(path), ranking, tuple(estimates), driver, left_out, remains)
 
@@ -373,6 +378,8 @@ def _exchange(
             own = ranking.statistic.get(found[i].name, -np.inf)
             if (
                 name is None
+                # It went with what it grew from, which the others do not hold.
+                or found[i].name not in ranking.statistic
                 or is_noise(name)
                 or name in (found[i].name, "outliers")
                 or score < max(own + EXCHANGE, threshold)
@@ -392,7 +399,7 @@ def _exchange(
 
     while True:
         found, estimate, rankings = chosen_again(found, estimate)
-        own = {i: ranking.statistic.get(found[i].name, -np.inf) for i, ranking in rankings.items()}
+        own = {i: r.statistic[found[i].name] for i, r in rankings.items() if found[i].name in r.statistic}
         needless = [i for i, v in own.items() if v < (SLOW_LEAD if found[i].name in SLOW_IN_TIME else threshold)]
         if not needless or len(found) < 2:
             return found, estimate, rankings

@@ -125,13 +125,14 @@ def driver_shape(scanner: Scanner, selection: Selection, name: str, unit: str) -
 def _nearest(ranking: Ranking, driver: str, explained: float) -> tuple[str, float, float]:
     """The catalogue effect of most evidence beside a driver: its share of what the curve explains, and how far behind.
 
-    Empty where none has any evidence.
+    Empty where none has any evidence, or more than the driver.
     """
-    name, statistic = ranking.best(drivers=False, but=("outliers",))
-    if name is None or statistic <= 0 or is_noise(name):
+    name, statistic = ranking.best(drivers=False, but=("outliers", *filter(is_noise, ranking.statistic)))
+    behind = ranking.statistic[driver] - statistic
+    if name is None or statistic <= 0 or behind <= 0:
         return "", 0.0, 0.0
     share = ranking.best_form(name)[1] / explained
-    return name, float(min(share, 1.0)), float(ranking.statistic[driver] - statistic)
+    return name, float(min(share, 1.0)), float(behind)
 
 
 def minimum_detectable(scanner: Scanner, ranking: Ranking, threshold: float, unit: str) -> dict[str, tuple[float, str]]:
@@ -164,8 +165,7 @@ def _in_unit(scanner: Scanner, name: str, effect: Effect | None, q: int, size: f
     assert effect is not None
     if effect.site == "gain":
         return size / factor("ppm", "1"), "ppm"
-    field = next(k for k, d in effect.declared().items() if d.linear)
-    declared = parameter_unit(effect, field, scanner.record.output_unit, scanner.record.units)
+    declared = parameter_unit(effect, effect.leading(), scanner.record.output_unit, scanner.record.units)
     return size * factor(internal_unit(declared), declared), declared
 
 

@@ -129,6 +129,11 @@ class Effect(eqx.Module):
         """Parameter declarations by field name."""
         return {f.name: f.metadata["parameter"] for f in fields(cls) if "parameter" in f.metadata}
 
+    def leading(self) -> str:
+        """The linear parameter that sizes are told of: the first, or, where that has no entries, the next."""
+        linear = [name for name, declared in self.declared().items() if declared.linear]
+        return next((name for name in linear if np.size(getattr(self, name))), linear[0])
+
     @classmethod
     def settings(cls) -> tuple[str, ...]:
         """Fields that are neither parameters nor the column and unit of a driver."""
