@@ -94,7 +94,7 @@ def build_bank(record: Record) -> Bank:
             if name != "bias_column":
                 not_testable[name] = "needs a column rate"
             continue
-        reason = _missing(kind, record)
+        reason = _missing(kind, record, signals)
         if reason:
             not_testable[name] = reason
         elif kind.scan and np.asarray(record.sampling.restart).sum() > 1:
@@ -139,8 +139,7 @@ def _structure(name: str, effect: Effect | None, width: int) -> str:
     return f"{name}/{shapes}/{getattr(effect, 'powers', '')}"
 
 
-def _missing(kind: type[Effect], record: Record) -> str:
-    usable = _usable(record)
+def _missing(kind: type[Effect], record: Record, usable: Signals) -> str:
     for name in kind.needs:
         if lacking((name,), usable):
             return f"needs a column {name}" + (f" in a unit like {usual_unit(name)}" if name in record.signals else "")
