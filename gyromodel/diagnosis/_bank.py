@@ -34,6 +34,8 @@ OWNERS = (
     | {f"magnetic_field_{axis}": "bias_magnetic" for axis in "xyz"}
     | {f"rate_{axis}": "misalignment" for axis in "xyz"}
 )
+# Before the name of an effect that is searched, but not in all its forms.
+PART_OF = "part of "
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ def build_bank(record: Record) -> Bank:
             if not forms:
                 not_testable[name] = kind.untested
             elif part := kind.hidden(signals):
-                not_testable[f"part of {name}"] = part
+                not_testable[PART_OF + name] = part
             blocks.extend((name, "effect", _weighted(e, signals, rate), e) for e in forms)
     for name in record.signals:
         reason = "" if is_no_driver(name) else unusable(record, name)

@@ -1,0 +1,34 @@
+"""What the search lays out of a campaign's columns: which names it tries, and why not the others."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from gyromodel.campaign import Campaign
+from gyromodel.diagnosis import isolability
+from gyromodel.model import GyroModel, model_from_effects
+
+ROWS, STEP = 200, 20.0
+
+
+def log(units: dict[str, str], **columns: np.ndarray) -> Campaign:
+    """A log of white noise with some columns."""
+    output = np.random.default_rng(1).standard_normal(ROWS)
+    values = {"time": np.arange(ROWS) * STEP, "output": output} | columns
+    return Campaign(values, {"time": "s", "output": "deg/h"} | units, {"kind": "rate"})
+
+
+def test_what_is_searched_in_part_is_named_as_the_effect():
+    turn = np.arange(ROWS) / 9.0
+    campaign = log(
+        {"acceleration_input": "g", "acceleration_spin": "g", "temperature": "degC"},
+        acceleration_input=np.cos(turn),
+        acceleration_spin=np.sin(turn),
+        temperature=np.full(ROWS, 20.0),
+    )
+    model = GyroModel(model_from_effects(["bias", "bias_temperature"]).effects, {"noise_white": jnp.asarray(5e-9)})
+    reasons = isolability(campaign, model, tests=False).not_testable
+    assert "centrifuge" in reasons["bias_acceleration_squared"]
+    # The model's temperature bias does not make a constant temperature one that a late thermometer shows in.
+    assert reasons["temperature_lag"] == "temperature does not vary"
