@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
+from gyromodel._checks import CampaignError
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis import isolability
+from gyromodel.diagnosis._bank import build_bank
+from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.model import GyroModel, model_from_effects
+from gyromodel.signals import read_signals
 
 ROWS, STEP = 200, 20.0
 
@@ -32,3 +37,16 @@ def test_what_is_searched_in_part_is_named_as_the_effect():
     assert "centrifuge" in reasons["bias_acceleration_squared"]
     # The model's temperature bias does not make a constant temperature one that a late thermometer shows in.
     assert reasons["temperature_lag"] == "temperature does not vary"
+
+
+def test_a_derived_driver_has_a_name_that_no_column_can_have():
+    flow, other = np.arange(ROWS) / 50.0, np.cos(np.arange(ROWS) / 30.0)
+    units = {"flow": "m^3/s", "flow_rate": "m^3/s^2"}
+    bank = build_bank(read_signals(log(units, flow=flow + 0.1 * flow**2, flow_rate=other)))
+    along = {b.name: np.asarray(b.along) for b in bank.blocks if b.kind == "driver" and "flow" in b.name}
+    assert {"smooth(flow)", "smooth(flow_rate)", "smooth(d(flow)/dt)", "smooth(flow[earlier])"} <= set(along)
+    assert np.corrcoef(along["smooth(flow_rate)"][:ROWS], other)[0, 1] > 0.999
+    assert smooth_columns("smooth(d(flow)/dt)") == ("d(flow)/dt",)
+    for name in ("d(flow)/dt", "flow[earlier]"):
+        with pytest.raises(CampaignError, match="cannot name a column"):
+            log({name: "s"}, **{name: flow})

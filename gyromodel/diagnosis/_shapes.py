@@ -171,7 +171,7 @@ def _in_unit(scanner: Scanner, name: str, effect: Effect | None, q: int, size: f
 
 
 def not_testable(scanner: Scanner, ranking: Ranking, model: GyroModel) -> dict[str, str]:
-    """Candidates that a campaign cannot show, in whole or in part, and those that vanish beside a model, with reasons."""
+    """Candidates that a campaign cannot show, wholly or in part, and those that vanish beside a model, with reasons."""
     result = ranking.results[ranking.best_cell()]
     tried = {b.name for b in scanner.bank.blocks if b.kind == "effect"} | set(ranking.tangents)
     known = (*tried, *model.labels)
