@@ -9,7 +9,8 @@ from scipy.signal import savgol_filter
 from gyromodel._checks import MISSING_STEP, CampaignError
 from gyromodel.campaign import AXES, Campaign
 
-# Seconds, and at least so many samples, through which a cubic is laid. Of 0.05 s it passes 99 % of a rate at 10 Hz.
+# Seconds, and at least so many samples, through which a cubic is laid. Sampled at 100 Hz or faster it passes 99 % of a
+# rate at 10 Hz, at 50 Hz 93 %.
 WINDOW, FEWEST = 0.05, 5
 COLUMNS = tuple(f"attitude_{part}" for part in "wxyz")
 

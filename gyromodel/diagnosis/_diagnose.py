@@ -160,6 +160,7 @@ def diagnose(
     gain = not_measured(unit) if not hold_out else _gain(session, baseline, selection, unit, scale, weights, say)
     driver = driver_shape(session.scanner, selection, judgement.driver, unit) if judgement.driver else None
     say("done", 1.0)
+    rankings = [*(f.ranking for f in selection.path), selection.last]
     whole = shortened[0][0] if len(shortened) == 1 else _together([c for c, _ in shortened])
     before, after = (np.asarray(e.model.predict(record.signals))[: record.rows] for e in (baseline, extended))
     slopes = [np.asarray(e.model.slope(record.signals))[: record.rows] for e in (baseline, extended)]
@@ -184,7 +185,7 @@ def diagnose(
         threshold=session.threshold,
         threshold_kind="calibrated" if calibrate else "safe",
         p_value=_p_value(selection, nulls) if calibrate else None,
-        searched=(*bank.names(), *selection.last.tangents),
+        searched=tuple(dict.fromkeys([*bank.names(), *(name for r in rankings for name in r.tangents)])),
         campaign=whole,
         predicted_before=from_internal(before, output_unit),
         predicted_after=from_internal(after, output_unit),

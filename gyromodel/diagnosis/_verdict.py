@@ -62,7 +62,7 @@ def credible(
     too_close = name in SLOW_IN_TIME and statistic < TIME_MARGIN and ranking.slow_noise
     if name not in ("outliers", "bias_step", "bias_periodic") and not is_noise(name):
         # Only the number of forms and coefficients sets them apart, which is no evidence.
-        own |= dict.fromkeys(ranking.twins(name) & own.keys(), own[name])
+        own |= {k: max(own[k], own[name]) for k in ranking.twins(name) & own.keys()}
     if runs < 2 and (hidden_by_walk or too_close):
         own["noise_random_walk"] = max(0.0, statistic - 1.0)
     top = max(own.values())
