@@ -9,6 +9,7 @@ import pytest
 from gyromodel._checks import CampaignError
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis import isolability
+from gyromodel.diagnosis._added_tests import added_tests
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.model import GyroModel, model_from_effects
@@ -50,3 +51,29 @@ def test_a_derived_driver_has_a_name_that_no_column_can_have():
     for name in ("d(flow)/dt", "flow[earlier]"):
         with pytest.raises(CampaignError, match="cannot name a column"):
             log({name: "s"}, **{name: flow})
+
+
+def test_an_angle_that_wraps_has_no_rate():
+    turn = np.arange(ROWS) * 5.0 % 360.0
+    names = build_bank(read_signals(log({"azimuth": "deg"}, azimuth=turn))).names()
+    assert "smooth(azimuth)" in names
+    assert not {"smooth(d(azimuth)/dt)", "smooth(azimuth[earlier])"} & set(names)
+
+
+def test_of_columns_that_serve_alike_the_missing_one_is_named():
+    spin = np.where(np.arange(ROWS) % 5 < 2, np.nan, np.sin(np.arange(ROWS) / 7.0))
+    bank = build_bank(read_signals(log({"rate_spin": "deg/s"}, rate_spin=spin)))
+    assert bank.not_testable["misalignment"] == "rate_spin is missing in 80 of 200 rows"
+
+
+def test_what_no_one_can_set_is_not_stepped():
+    i = np.arange(ROWS)
+    campaign = log(
+        {"feedback_ramp": "count", "rate_estimated": "deg/s", "attitude_w": "", "supply_voltage": "V"},
+        feedback_ramp=i % 16.0,
+        rate_estimated=np.sin(i),
+        attitude_w=np.cos(i),
+        supply_voltage=i / 50.0,
+    )
+    stepped = [t.sentence.split()[1] for t in added_tests(campaign) if t.sentence.startswith("Step ")]
+    assert stepped == ["supply_voltage"]

@@ -8,11 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from gyromodel._checks import accelerations, along_axes, thermometers
+from gyromodel.attitude import COLUMNS
 from gyromodel.campaign import Campaign
+from gyromodel.diagnosis._drivers import NOT_DRIVERS
 from gyromodel.units import from_internal
 
 # Columns that a test cannot step by themselves.
-NOT_SET = ("segment", "run", "position", "rate", "rate_spin", "rate_output", "azimuth")
+NOT_SET = (*NOT_DRIVERS, *COLUMNS, "rate", "rate_spin", "rate_output", "azimuth")
 # Rates (rad/s) up to which the Earth alone turns the gyro, and to which a table turns it about another axis.
 EARTH, FAST = np.deg2rad(16.0 / 3600.0), np.deg2rad(10.0)
 # How many times as fast the temperature is cycled, and how often up and down at least.

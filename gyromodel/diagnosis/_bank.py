@@ -145,8 +145,9 @@ def _missing(kind: type[Effect], record: Record, usable: Signals) -> str:
     for name in kind.needs:
         if lacking((name,), usable):
             return f"needs a column {name}" + (f" in a unit like {usual_unit(name)}" if name in record.signals else "")
-        if name in record.signals and (reason := unusable(record, name)):
-            return reason
+        reasons = [unusable(record, n) for n in name.split(" or ") if n in usable]
+        if reasons and all(reasons):
+            return " and ".join(reasons)
     return ""
 
 
