@@ -19,6 +19,7 @@ from gyromodel._checks import thermometers
 from gyromodel.averages import followed
 from gyromodel.campaign import Campaign
 from gyromodel.effects import Signals
+from gyromodel.effects.power_cycles import BiasTurnOn
 from gyromodel.estimate import Calibration, check_covariates, validity_unit
 from gyromodel.model import GyroModel, ModelError, check_units
 from gyromodel.signals import Record, rate_output, read_signals
@@ -151,6 +152,13 @@ def _notes(
         margin = SURELY * np.nan_to_num(std) if name == "rate" else ROUNDING * max(abs(low), abs(high))
         if outside := int((present & ((values < low - margin) | (values > high + margin))).sum()):
             notes.append(f"{outside} of {present.sum()} samples lie outside the calibrated range of {name}, {limits}.")
+    for runs in [np.asarray(e.runs) for e in model.effects if isinstance(e, BiasTurnOn)]:
+        if other := int((present & ~np.isin(np.asarray(record.signals["run"])[: record.rows], runs)).sum()):
+            known = ", ".join(f"{r:g}" for r in runs)
+            notes.append(
+                f"{other} of {present.sum()} samples are of other runs than {known} and take the first run's bias: "
+                "what turn-ons differ by is not in rate_estimated_std."
+            )
     if timed := [e.label for e in model.effects if "time" in e.columns_needed]:
         notes.append(f"Time in {', '.join(dict.fromkeys(timed))} counts from the start of this campaign.")
     if calibration.covariance is None and model.slots():
