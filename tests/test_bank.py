@@ -12,7 +12,7 @@ from gyromodel.diagnosis import isolability
 from gyromodel.diagnosis._added_tests import added_tests
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._drivers import smooth_columns
-from gyromodel.model import GyroModel, model_from_effects
+from gyromodel.model import GyroModel, check_units, model_from_effects
 from gyromodel.signals import read_signals
 
 ROWS, STEP = 200, 20.0
@@ -77,3 +77,11 @@ def test_what_no_one_can_set_is_not_stepped():
     )
     stepped = [t.sentence.split()[1] for t in added_tests(campaign) if t.sentence.startswith("Step ")]
     assert stepped == ["supply_voltage"]
+
+
+@pytest.mark.parametrize("unit", ["count", "bit", "V", "rad", ""])
+def test_codes_of_a_ramp_are_searched_in_any_unit_it_may_have(unit: str):
+    campaign = log({"feedback_ramp": unit}, feedback_ramp=np.arange(ROWS) * 7.0 % 64.0)
+    record = read_signals(campaign)
+    assert "bias_readout_code" in build_bank(record).names()
+    check_units(model_from_effects(["bias_readout_code"]), record.output_unit, record.units)
