@@ -12,6 +12,7 @@ from gyromodel.diagnosis import isolability
 from gyromodel.diagnosis._added_tests import added_tests
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._drivers import smooth_columns
+from gyromodel.effects.geometry import cross_rates
 from gyromodel.model import GyroModel, check_units, model_from_effects
 from gyromodel.signals import read_signals
 
@@ -85,3 +86,16 @@ def test_codes_of_a_ramp_are_searched_in_any_unit_it_may_have(unit: str):
     record = read_signals(campaign)
     assert "bias_readout_code" in build_bank(record).names()
     check_units(model_from_effects(["bias_readout_code"]), record.output_unit, record.units)
+
+
+def test_the_rate_about_the_input_axis_is_no_cross_rate():
+    turns = {f"rate_{a}": np.sin(np.arange(ROWS) / (5.0 + i)) for i, a in enumerate(("input", "spin", "output"))}
+    assert cross_rates(turns) == ["rate_spin", "rate_output"]
+    turns = {f"rate_{a}": v for a, v in zip("xyz", turns.values(), strict=True)}
+    record = read_signals(log(dict.fromkeys(turns, "deg/s"), **turns))
+    assert "not known which is the input axis" in build_bank(record).not_testable["misalignment"]
+    with pytest.raises(CampaignError, match=r"about: \[rate_x, rate_y\]"):
+        model_from_effects(["misalignment"]).prepared(record.signals)
+    del turns["rate_z"]
+    record = read_signals(log(dict.fromkeys(turns, "deg/s"), **turns))
+    assert "misalignment" in build_bank(record).names()
