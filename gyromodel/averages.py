@@ -56,16 +56,11 @@ def average(campaign: Campaign, maximum: int = MAXIMUM_ROWS, seconds: float = 0.
     return Campaign(columns, campaign.units, campaign.metadata, campaign.name), together
 
 
-def followed(campaign: Campaign, maximum: int = MAXIMUM_ROWS) -> tuple[Campaign, int]:
-    """As `average`, of a campaign whose reference rate comes from an attitude over as long as the rate is good for."""
-    return average(campaign, maximum, MEAN_OF_ATTITUDE * (campaign.metadata.get("reference") == "attitude"))
-
-
 def _as_rate(campaign: Campaign) -> Campaign:
+    output, _ = rate_output(campaign)
     unit = f"{campaign.units['output']}/s"
-    output = from_internal(rate_output(campaign)[0], unit)
     return Campaign(
-        {**campaign.columns, "output": output},
+        {**campaign.columns, "output": from_internal(output, unit)},
         {**campaign.units, "output": unit},
         {**campaign.metadata, "kind": "rate"},
         campaign.name,

@@ -116,7 +116,7 @@ class Campaign:
         """One axis of a three-axis campaign as a single-axis one.
 
         `output_x` becomes `output`, `rate_x` becomes `rate`, and `temperature_x` becomes `temperature` where there is
-        none; the other outputs go and every other column stays.
+        none; the other outputs go and every other column stays. Metadata `axis` says which it was.
 
         Args:
             axis: `"x"`, `"y"` or `"z"`.
@@ -136,7 +136,7 @@ class Campaign:
         kept = [name for name in self.columns if name not in self.outputs or name in renamed]
         columns = {renamed.get(name, name): self.columns[name] for name in kept}
         units = {renamed.get(name, name): self.units[name] for name in kept}
-        return self._derived(columns, units, f"{self.name}_{axis}")
+        return self._derived(columns, units, f"{self.name}_{axis}").with_metadata({"axis": axis})
 
     def gaps(self) -> list[tuple[int, float]]:
         """Steps in time longer than 1.5 times the median step: index of the row after it, from 0, and length in s."""

@@ -127,10 +127,13 @@ def demo(as_json: AsJson = False) -> None:
 def fit(campaigns: Campaigns, model: ModelFile, output: Folder, axis: Axis = None, as_json: AsJson = False) -> None:
     """Fit a model to the campaigns of one unit, jointly."""
     _prepare(output, model)
+    from gyromodel.attitude import with_reference_rates
     from gyromodel.estimate import fit as fit_model
     from gyromodel.model_files import read_model, write_model
 
     start, measured = read_model(model), _read(campaigns, axis)
+    for line in [line for campaign in measured if (line := with_reference_rates(campaign)[1])]:
+        print(f"gyromodel: {line}", file=sys.stderr)
     with _progress() as progress:
         estimate = fit_model(measured, start, progress=progress)
     result = estimate.to_dict()
@@ -196,7 +199,6 @@ def simulate(
     if pattern_file is None or (like and plan):
         raise typer.BadParameter("give either --like CAMPAIGN or --plan PLAN.yaml", param_hint="--like")
     _refuse_overwriting(output, [model, pattern_file])
-    from gyromodel.attitude import with_reference_rates
     from gyromodel.files import read_campaign, write_campaign
     from gyromodel.model import simulate as simulate_campaign
     from gyromodel.model_files import read_model
@@ -204,7 +206,6 @@ def simulate(
 
     simulated_by = read_model(model)
     pattern = read_plan(pattern_file) if plan else read_campaign(pattern_file)
-    pattern = with_reference_rates(pattern)
     simulated = simulate_campaign(simulated_by, pattern.axis(axis) if axis else pattern, seed)
     output.parent.mkdir(parents=True, exist_ok=True)
     write_campaign(simulated, output)
@@ -401,10 +402,9 @@ def _diagnose(
 
 
 def _read(paths: Sequence[Path], axis: str | None) -> list[Campaign]:
-    from gyromodel.attitude import with_reference_rates
     from gyromodel.files import read_campaign
 
-    measured = [with_reference_rates(read_campaign(path)) for path in paths]
+    measured = [read_campaign(path) for path in paths]
     return [campaign.axis(axis) for campaign in measured] if axis else measured
 
 

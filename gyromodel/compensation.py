@@ -16,7 +16,8 @@ from jaxtyping import Array, Float
 from scipy import stats
 
 from gyromodel._checks import thermometers
-from gyromodel.averages import followed
+from gyromodel.attitude import with_reference_rates
+from gyromodel.averages import MEAN_OF_ATTITUDE, average
 from gyromodel.campaign import Campaign
 from gyromodel.effects import Signals
 from gyromodel.effects.power_cycles import BiasTurnOn
@@ -49,7 +50,8 @@ def compensate(campaign: Campaign, calibration: Calibration) -> Campaign:
     (metadata `rate_estimated_std_holds`); not flicker and random walk, nor that of parameters held fixed. Both columns
     are NaN where the output is missing, or where the model gives it at no rate on the branch through rest. Such
     samples, those outside the calibrated ranges and what else a user must know are counted in the metadata
-    `rate_estimated_note`. A column `rate` is not needed and not used.
+    `rate_estimated_note`. A column `rate` is not needed and not used. Rates about the other axes that the model needs
+    and the campaign lacks are those of its attitude; where that is missing, so is the estimate.
 
     Args:
         campaign: one axis, with the covariates that the model needs.
@@ -60,7 +62,10 @@ def compensate(campaign: Campaign, calibration: Calibration) -> Campaign:
         ModelError: the model needs a column that the campaign lacks, is of other units, or an effect depends on the
             rates of other samples.
     """
-    record = read_signals(campaign)
+    needed = {name for effect in calibration.model.effects for name in effect.columns_needed}
+    turned = needed & {"rate_x", "rate_y", "rate_z"} - set(campaign.columns)
+    rated = with_reference_rates(campaign)[0] if turned else campaign
+    record = read_signals(rated)
     record = record._replace(signals=record.signals | {"rate": jnp.zeros_like(record.signals["time"])})
     # What the calibration leaves open, such as which thermometers, is the campaign's; what it states stays.
     model = calibration.model.prepared(record.signals)
@@ -71,8 +76,11 @@ def compensate(campaign: Campaign, calibration: Calibration) -> Campaign:
     check_units(model, record.output_unit, record.units)
     rate, variance = _estimate(calibration, record)
     notes = _notes(campaign, calibration, record, rate, np.sqrt(variance))
-    campaign = campaign.with_column("rate_estimated", from_internal(rate, "deg/s"), "deg/s")
-    campaign = campaign.with_column("rate_estimated_std", from_internal(np.sqrt(variance), "deg/s"), "deg/s")
+    known = np.isin(campaign.columns["time"], rated.columns["time"])
+    for name, values in (("rate_estimated", rate), ("rate_estimated_std", np.sqrt(variance))):
+        column = np.full(len(campaign), np.nan)
+        column[known] = from_internal(values, "deg/s")
+        campaign = campaign.with_column(name, column, "deg/s")
     return campaign.with_metadata({
         "rate_estimated_std_holds": ", ".join(_held(calibration)) or "nothing",
         "rate_estimated_note": " ".join(notes) or None,
@@ -96,7 +104,8 @@ def reference_error(compensated: Campaign) -> ErrorAgainstReference | None:
     Args:
         compensated: what `compensate` returned.
     """
-    compensated, _ = followed(compensated, len(compensated))
+    rated, _ = with_reference_rates(compensated)
+    compensated, _ = average(rated, len(rated), MEAN_OF_ATTITUDE * (rated is not compensated))
     output, unit = rate_output(compensated)
     if "rate" not in compensated.columns or unit != "rad/s":
         return None

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import chi2
 
+from gyromodel.attitude import with_reference_rates
 from gyromodel.campaign import AXES, Campaign
 from gyromodel.effects.geometry import Misalignment
 from gyromodel.estimate import Estimate, EstimateError, fit
@@ -79,7 +80,8 @@ def triad(campaigns: Sequence[Campaign], extended: Mapping[str, Estimate]) -> Tr
         campaigns: three-axis campaigns of one unit, with reference rates about all axes.
         extended: the extended fit of each axis, by its letter.
     """
-    if any(set(AXES) - set(extended) or not {f"rate_{a}" for a in AXES} <= set(c.columns) for c in campaigns):
+    rated = [with_reference_rates(c)[0] for c in campaigns]
+    if any(set(AXES) - set(extended) or not {f"rate_{a}" for a in AXES} <= set(c.columns) for c in rated):
         return None
     lean, covariance = np.zeros((3, 3)), np.zeros((9, 9))
     for i, axis in enumerate(AXES):

@@ -9,7 +9,8 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 
-from gyromodel.averages import average, followed
+from gyromodel.attitude import with_reference_rates
+from gyromodel.averages import MEAN_OF_ATTITUDE, average
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores
@@ -92,16 +93,19 @@ def diagnose(
     if 0 < calibrate < FEWEST_DRAWS:
         raise ValueError(f"{calibrate} draws cannot show a 99 % point: calibrate with {FEWEST_DRAWS} or more, or 0")
     say = progress or (lambda line, done: None)
-    given = [campaigns] if isinstance(campaigns, Campaign) else list(campaigns)
+    measured = [campaigns] if isinstance(campaigns, Campaign) else list(campaigns)
+    given, of_attitude = zip(*(with_reference_rates(c) for c in measured), strict=True)
     campaigns = [at_rest(c) for c in given]
-    findings = [
+    findings = [line for line in of_attitude if line]
+    findings += [
         f"{len(np.unique(posed.columns['position']))} static poses were found in {c.name}; {len(c) - len(posed)} rows "
         "in motion were left out."
         for c, posed in zip(given, campaigns, strict=True)
         if posed is not c
     ]
     shortened = [
-        followed(c) if c is g else average(c, seconds=MEAN_OF_POSE) for c, g in zip(campaigns, given, strict=True)
+        average(c, seconds=MEAN_OF_POSE if c is not g else MEAN_OF_ATTITUDE * (g is not m))
+        for c, g, m in zip(campaigns, given, measured, strict=True)
     ]
     if any(m > 1 for _, m in shortened):
         most = max(m for _, m in shortened)
@@ -155,8 +159,10 @@ def diagnose(
     judgement = judge(record, session.scanner, baseline, selection, extended, len(bank.names()), nulls)
     next_test = judgement.next_test
     if judgement.verdict == "ambiguous":
-        measured = [c for c, _ in shortened]
-        next_test = settling_test(measured, baseline.model, extended, list(judgement.credible_set)) or next_test
+        next_test = (
+            settling_test([c for c, _ in shortened], baseline.model, extended, list(judgement.credible_set))
+            or next_test
+        )
     gain = not_measured(unit) if not hold_out else _gain(session, baseline, selection, unit, scale, weights, say)
     driver = driver_shape(session.scanner, selection, judgement.driver, unit) if judgement.driver else None
     say("done", 1.0)
