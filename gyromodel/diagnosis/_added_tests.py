@@ -44,13 +44,10 @@ def added_tests(campaign: Campaign) -> Iterator[AddedTest]:
     if "azimuth" in campaign.columns:
         turned = campaign.columns["azimuth"] + from_internal(np.pi / 2, campaign.units["azimuth"])
         yield AddedTest("Turn the gyro by 90° in azimuth and repeat.", _with(campaign, azimuth=turned))
-    together = (
-        *along_axes("rate", campaign.columns),
-        *thermometers(campaign.columns),
-        *accelerations(campaign.columns),
-    )
+    columns = campaign.columns
+    kept = {*NOT_SET, *along_axes("rate", columns), *thermometers(columns), *accelerations(columns)}
     for name in campaign.covariates:
-        if name in (*NOT_SET, *together) or not np.ptp(campaign.columns[name]) > 0:
+        if name in kept or not np.ptp(campaign.columns[name]) > 0:
             continue
         still = {
             other: np.full(len(campaign), np.median(campaign.columns[other]))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gyromodel.attitude import with_reference_rates
-from gyromodel.averages import MEAN_OF_ATTITUDE, average
+from gyromodel.averages import MEAN_OF_ATTITUDE, MOST_TURN, average, turning
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores
@@ -113,6 +113,8 @@ def diagnose(
             f"Means of {most} consecutive samples were searched: lines above their sample rate and quantisation are "
             "averaged away."
         )
+    far = dict.fromkeys(n for c, (_, m) in zip(campaigns, shortened, strict=True) for n in turning(c, m))
+    findings += [f"{n} turns by more than {MOST_TURN:g} deg within a mean, which weakens what follows it." for n in far]
     findings += [
         f"The first {len(c)} of {len(g)} rows were searched: means tell nothing of the feedback ramp's codes."
         for g, (c, m) in zip(campaigns, shortened, strict=True)
@@ -159,10 +161,8 @@ def diagnose(
     judgement = judge(record, session.scanner, baseline, selection, extended, len(bank.names()), nulls)
     next_test = judgement.next_test
     if judgement.verdict == "ambiguous":
-        next_test = (
-            settling_test([c for c, _ in shortened], baseline.model, extended, list(judgement.credible_set))
-            or next_test
-        )
+        searched = [c for c, _ in shortened]
+        next_test = settling_test(searched, baseline.model, extended, list(judgement.credible_set)) or next_test
     gain = not_measured(unit) if not hold_out else _gain(session, baseline, selection, unit, scale, weights, say)
     driver = driver_shape(session.scanner, selection, judgement.driver, unit) if judgement.driver else None
     say("done", 1.0)

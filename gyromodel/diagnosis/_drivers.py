@@ -13,7 +13,7 @@ import numpy as np
 from gyromodel._checks import DERIVED
 from gyromodel.declarations import EARLIER, RATE_OF, measured
 from gyromodel.signals import Record, thermometer_rate
-from gyromodel.units import internal_unit
+from gyromodel.units import is_angle
 
 # Length scales of the smooth functions, as parts of the driver's range.
 SMOOTH_SCALES = (0.08, 0.2, 0.5)
@@ -49,7 +49,9 @@ def smooths(record: Record) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     names = driver_names(record)
     for name in (*names, "time"):
         yield from _of_one(record, f"smooth({name})", np.asarray(record.signals[name]))
-    for name in (n for n in names if n not in ("rate", "campaign") and not _is_angle(record, n) and _slow(record, n)):
+    for name in (n for n in names if n not in ("rate", "campaign") and _slow(record, n)):
+        if is_angle(record.units[name]):
+            continue  # it may wrap round, which is no rate of change
         for derived, values in _history(record, name):
             yield from _of_one(record, f"smooth({derived})", values)
     rate_first = sorted(names, key=lambda n: n not in ("rate", "temperature"))[:3]
@@ -89,11 +91,6 @@ def _bumps(record: Record, values: np.ndarray, scale: float) -> np.ndarray:
 def _runs(record: Record) -> list[np.ndarray]:
     number = np.cumsum(np.asarray(record.sampling.restart)[: record.rows])
     return [np.flatnonzero(number == i) for i in np.unique(number)]
-
-
-def _is_angle(record: Record, name: str) -> bool:
-    """Whether a column may wrap round, which is no rate of change."""
-    return internal_unit(record.units.get(name, "")) == "rad"
 
 
 def _slow(record: Record, name: str) -> bool:
