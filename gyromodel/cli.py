@@ -359,26 +359,34 @@ def effects(
 def _diagnose_axes(
     measured: Sequence[Campaign], model: Path, output: Path, calibrate: int, seed: int
 ) -> tuple[dict[str, Any], str, tuple[str, ...]]:
-    """Diagnose each axis that measures something, and how the axes lie together; the answer, its words, the files."""
+    """Diagnose each axis that can be, and how the axes lie together; the answer, its words, the files."""
     from gyromodel._checks import CampaignError
+    from gyromodel.estimate import EstimateError
+    from gyromodel.model import ModelError
     from gyromodel.three_axes import triad
 
-    axes, said, written, extended = {}, [], [], {}
+    axes, not_diagnosed, said, written, extended = {}, {}, [], [], {}
     for name in measured[0].outputs:
         axis = name.removeprefix("output_")
+        dead = [reason for c in measured if name in c.columns and (reason := c.dead(name))]
         try:
-            alone = [campaign.axis(axis) for campaign in measured]
-        except CampaignError as dead:
-            print(f"gyromodel: {dead}", file=sys.stderr)
+            if not dead:
+                alone = [campaign.axis(axis) for campaign in measured]
+                diagnosis, verdict = _diagnose(alone, model, output / axis, calibrate=calibrate, seed=seed)
+        except (EstimateError, ModelError) as error:
+            dead = [str(error)]
+        if dead:
+            not_diagnosed[axis] = dead[0]
             continue
-        diagnosis, verdict = _diagnose(alone, model, output / axis, calibrate=calibrate, seed=seed)
         axes[axis], extended[axis] = diagnosis.to_dict() | {"model": f"{axis}/model.yaml"}, diagnosis.extended
         said.append(f"Axis {axis}: {verdict}")
         written += [f"{axis}/{report}" for report in REPORTS]
     if not axes:
-        raise CampaignError("no axis measures anything")
+        raise CampaignError(f"no axis can be diagnosed; {'; '.join(f'{a}: {why}' for a, why in not_diagnosed.items())}")
+    for axis, reason in not_diagnosed.items():
+        print(f"gyromodel: axis {axis} was not diagnosed: {reason}", file=sys.stderr)
     lie = triad(measured, extended)
-    result = {"axes": axes, "triad": lie and lie.to_dict()}
+    result = {"axes": axes, "not_diagnosed": not_diagnosed, "triad": lie and lie.to_dict()}
     write_text(output / "axes.json", _json(result))
     return result, "\n".join([*said, *([lie.sentence()] if lie else [])]), (*written, "axes.json")
 

@@ -14,6 +14,7 @@ from gyromodel.attitude import with_reference_rates
 from gyromodel.campaign import AXES, Campaign
 from gyromodel.effects.geometry import Misalignment
 from gyromodel.estimate import Estimate, EstimateError, fit
+from gyromodel.model import ModelError
 from gyromodel.units import factor
 
 # A rotation or a deviation from right angles is one beyond this chance.
@@ -92,7 +93,7 @@ def triad(campaigns: Sequence[Campaign], extended: Mapping[str, Estimate]) -> Tr
             model = model.without("misalignment")
         try:
             fitted = fit([c.axis(axis) for c in campaigns], model.with_effect(Misalignment(about=about)))
-        except EstimateError:
+        except (EstimateError, ModelError):
             return None
         angles = fitted.propagate(lambda m: m.effects[m.labels.index("misalignment")].linear())
         lean[i, others] = angles.value
