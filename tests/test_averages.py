@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gyromodel._checks import CampaignError
 from gyromodel.averages import average, turning
 from gyromodel.campaign import Campaign
 
@@ -41,3 +42,10 @@ def test_angles_that_turn_far_within_a_mean_are_told():
     assert turning(turned(6.1), 5) == ["azimuth"]
     assert turning(turned(1.1), 5) == []
     assert turning(turned(6.1), 1) == []
+
+
+def test_three_axes_of_increments_are_asked_to_choose_one():
+    columns = {"time": np.arange(ROWS) * 1.0} | {f"output_{a}": np.sin(np.arange(ROWS)) for a in "xyz"}
+    campaign = Campaign(columns, {n: "s" if n == "time" else "arcsec" for n in columns}, {"kind": "increment"})
+    with pytest.raises(CampaignError, match="choose one axis"):
+        average(campaign, 200)
