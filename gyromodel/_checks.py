@@ -93,9 +93,11 @@ def usual_unit(name: str) -> str:
 
 
 def of_usual_unit(name: str, unit: str) -> bool:
-    """Whether a column is in a unit that the effects of that column can take, which raw counts are not."""
-    usual = usual_unit(name)
-    return not usual or unit_system.convertible(unit, usual)
+    """Whether a column is in a unit that the effects of that column can take, which raw counts of a measure are not."""
+    known = _known(name)
+    if not known:
+        return name not in _USUAL or unit_system.convertible(unit, _USUAL[name])
+    return any(unit_system.convertible(unit, e) for e in known[1] if e != "count" or e == known[1][0])
 
 
 def check_time(time: np.ndarray, first_row: int = 1, previous: float | None = None) -> None:

@@ -6,9 +6,11 @@ import numpy as np
 
 from gyromodel.campaign import Campaign
 from gyromodel.signals import GAP, rate_output
-from gyromodel.units import from_internal
+from gyromodel.units import factor, from_internal, is_angle
 
 MAXIMUM_ROWS = 20_000
+# Degrees that an angle may turn within a mean: a cosine loses 1 % of its amplitude.
+MOST_TURN = 30.0
 # Rates from an attitude err by its noise and its smoothing at high frequencies; their means over so long (s) hardly do.
 MEAN_OF_ATTITUDE = 0.2
 
@@ -16,7 +18,8 @@ MEAN_OF_ATTITUDE = 0.2
 def average(campaign: Campaign, maximum: int = MAXIMUM_ROWS, seconds: float = 0.0) -> tuple[Campaign, int]:
     """Means of consecutive samples, never across a gap or a change of segment, run or position.
 
-    Increments and angles become rates, so that a mean is one whatever its samples' spacing. Where a stretch ends, a
+    Increments and angles of the output become rates, so that a mean is one whatever its samples' spacing; other angles
+    are averaged by cosine and sine. Where a stretch ends, a
     last group of less than half the samples is dropped, unless it is all of the stretch. Of a campaign with a feedback
     ramp the first samples are kept as they are: a mean over its turns tells nothing of its codes.
 
@@ -53,19 +56,34 @@ def average(campaign: Campaign, maximum: int = MAXIMUM_ROWS, seconds: float = 0.
         seen = np.isfinite(values)
         total, count = (np.add.reduceat(x, starts)[kept] for x in (np.where(seen, values, 0.0), seen.astype(float)))
         columns[name] = np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
+        if is_angle(campaign.units[name]):
+            # By its cosine and sine, beside the first value of the group: 359 and 1 deg have the mean 360 deg.
+            first_seen = np.minimum.reduceat(np.where(seen, np.arange(rows), rows - 1), starts)
+            origin, scale = values[first_seen], factor("rad", campaign.units[name])
+            away = (values - np.repeat(origin, counts)) / scale
+            sine, cosine = (np.add.reduceat(np.where(seen, f(away), 0.0), starts) for f in (np.sin, np.cos))
+            columns[name] = np.where(count > 0, (origin + np.arctan2(sine, cosine) * scale)[kept], np.nan)
     return Campaign(columns, campaign.units, campaign.metadata, campaign.name), together
 
 
-def followed(campaign: Campaign, maximum: int = MAXIMUM_ROWS) -> tuple[Campaign, int]:
-    """As `average`, of a campaign whose reference rate comes from an attitude over as long as the rate is good for."""
-    return average(campaign, maximum, MEAN_OF_ATTITUDE * (campaign.metadata.get("reference") == "attitude"))
+def turning(campaign: Campaign, together: int) -> list[str]:
+    """Angles that often turn so far within a mean of so many samples that their cosine and sine lose by it."""
+    found = []
+    for name in campaign.covariates:
+        if is_angle(campaign.units[name]) and together > 1:
+            angle = campaign.si(name)
+            angle = np.unwrap(angle[np.isfinite(angle)])
+            turned = np.abs(angle[together:] - angle[:-together])
+            if len(turned) and np.quantile(turned, 0.9) > np.deg2rad(MOST_TURN):
+                found.append(name)
+    return found
 
 
 def _as_rate(campaign: Campaign) -> Campaign:
+    output, _ = rate_output(campaign)
     unit = f"{campaign.units['output']}/s"
-    output = from_internal(rate_output(campaign)[0], unit)
     return Campaign(
-        {**campaign.columns, "output": output},
+        {**campaign.columns, "output": from_internal(output, unit)},
         {**campaign.units, "output": unit},
         {**campaign.metadata, "kind": "rate"},
         campaign.name,

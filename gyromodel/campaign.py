@@ -116,7 +116,7 @@ class Campaign:
         """One axis of a three-axis campaign as a single-axis one.
 
         `output_x` becomes `output`, `rate_x` becomes `rate`, and `temperature_x` becomes `temperature` where there is
-        none; the other outputs go and every other column stays.
+        none; the other outputs go and every other column stays. Metadata `axis` says which it was.
 
         Args:
             axis: `"x"`, `"y"` or `"z"`.
@@ -126,7 +126,7 @@ class Campaign:
         """
         if axis not in AXES or f"output_{axis}" not in self.columns:
             raise CampaignError(f"there is no axis '{axis}': the outputs are {listed(self.outputs)}")
-        if reason := _dead(f"output_{axis}", self.columns[f"output_{axis}"]):
+        if reason := self.dead(f"output_{axis}"):
             raise CampaignError(reason)
         renamed = {f"output_{axis}": "output", f"rate_{axis}": "rate"}
         if f"rate_{axis}" in self.columns and "rate" in self.columns:
@@ -136,7 +136,16 @@ class Campaign:
         kept = [name for name in self.columns if name not in self.outputs or name in renamed]
         columns = {renamed.get(name, name): self.columns[name] for name in kept}
         units = {renamed.get(name, name): self.units[name] for name in kept}
-        return self._derived(columns, units, f"{self.name}_{axis}")
+        return self._derived(columns, units, f"{self.name}_{axis}").with_metadata({"axis": axis})
+
+    def dead(self, output: str) -> str:
+        """Why an output measures nothing; empty where it does. One dead axis does not stop the others."""
+        values = self._column(output)
+        known = values[~np.isnan(values)]
+        if not len(known):
+            return f"column '{output}' has no value: every row is missing"
+        constant = (known == known[0]).all()
+        return f"column '{output}' is {known[0]} in every row, so that it measures nothing" if constant else ""
 
     def gaps(self) -> list[tuple[int, float]]:
         """Steps in time longer than 1.5 times the median step: index of the row after it, from 0, and length in s."""
@@ -195,15 +204,6 @@ class Campaign:
         object.__setattr__(self, "metadata", MappingProxyType(metadata))
 
 
-def _dead(name: str, values: np.ndarray) -> str:
-    """Why an output measures nothing; empty where it does. One dead axis does not stop the others."""
-    known = values[~np.isnan(values)]
-    if not len(known):
-        return f"column '{name}' has no value: every row is missing"
-    constant = (known == known[0]).all()
-    return f"column '{name}' is {known[0]} in every row, so that it measures nothing" if constant else ""
-
-
 def _restore(columns: Mapping[str, Any], units: Mapping[str, str], metadata: Mapping[str, Any], name: str) -> Campaign:
     campaign = object.__new__(Campaign)
     for key, value in (("columns", columns), ("units", units), ("metadata", metadata), ("name", name)):
@@ -222,7 +222,7 @@ def _check_usable(campaign: Campaign) -> None:
         raise CampaignError(f"give either 'output' or axes, not both: found {listed(outputs)}")
     if len(campaign) < 3:
         raise CampaignError(f"there are {len(campaign)} rows of data, and at least 3 are needed")
-    dead = [reason for name in outputs if (reason := _dead(name, campaign.columns[name]))]
+    dead = [reason for name in outputs if (reason := campaign.dead(name))]
     if len(dead) == len(outputs):
         raise CampaignError(dead[0])
     if "kind" not in campaign.metadata:

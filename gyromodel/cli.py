@@ -127,10 +127,13 @@ def demo(as_json: AsJson = False) -> None:
 def fit(campaigns: Campaigns, model: ModelFile, output: Folder, axis: Axis = None, as_json: AsJson = False) -> None:
     """Fit a model to the campaigns of one unit, jointly."""
     _prepare(output, model)
+    from gyromodel.attitude import with_reference_rates
     from gyromodel.estimate import fit as fit_model
     from gyromodel.model_files import read_model, write_model
 
     start, measured = read_model(model), _read(campaigns, axis)
+    for line in [line for campaign in measured if (line := with_reference_rates(campaign)[1])]:
+        print(f"gyromodel: {line}", file=sys.stderr)
     with _progress() as progress:
         estimate = fit_model(measured, start, progress=progress)
     result = estimate.to_dict()
@@ -196,7 +199,6 @@ def simulate(
     if pattern_file is None or (like and plan):
         raise typer.BadParameter("give either --like CAMPAIGN or --plan PLAN.yaml", param_hint="--like")
     _refuse_overwriting(output, [model, pattern_file])
-    from gyromodel.attitude import with_reference_rates
     from gyromodel.files import read_campaign, write_campaign
     from gyromodel.model import simulate as simulate_campaign
     from gyromodel.model_files import read_model
@@ -204,7 +206,6 @@ def simulate(
 
     simulated_by = read_model(model)
     pattern = read_plan(pattern_file) if plan else read_campaign(pattern_file)
-    pattern = with_reference_rates(pattern)
     simulated = simulate_campaign(simulated_by, pattern.axis(axis) if axis else pattern, seed)
     output.parent.mkdir(parents=True, exist_ok=True)
     write_campaign(simulated, output)
@@ -358,26 +359,34 @@ def effects(
 def _diagnose_axes(
     measured: Sequence[Campaign], model: Path, output: Path, calibrate: int, seed: int
 ) -> tuple[dict[str, Any], str, tuple[str, ...]]:
-    """Diagnose each axis that measures something, and how the axes lie together; the answer, its words, the files."""
+    """Diagnose each axis that can be, and how the axes lie together; the answer, its words, the files."""
     from gyromodel._checks import CampaignError
+    from gyromodel.estimate import EstimateError
+    from gyromodel.model import ModelError
     from gyromodel.three_axes import triad
 
-    axes, said, written, extended = {}, [], [], {}
+    axes, not_diagnosed, said, written, extended = {}, {}, [], [], {}
     for name in measured[0].outputs:
         axis = name.removeprefix("output_")
+        dead = [reason for c in measured if name in c.columns and (reason := c.dead(name))]
         try:
-            alone = [campaign.axis(axis) for campaign in measured]
-        except CampaignError as dead:
-            print(f"gyromodel: {dead}", file=sys.stderr)
+            if not dead:
+                alone = [campaign.axis(axis) for campaign in measured]
+                diagnosis, verdict = _diagnose(alone, model, output / axis, calibrate=calibrate, seed=seed)
+        except (EstimateError, ModelError) as error:
+            dead = [str(error)]
+        if dead:
+            not_diagnosed[axis] = dead[0]
             continue
-        diagnosis, verdict = _diagnose(alone, model, output / axis, calibrate=calibrate, seed=seed)
         axes[axis], extended[axis] = diagnosis.to_dict() | {"model": f"{axis}/model.yaml"}, diagnosis.extended
         said.append(f"Axis {axis}: {verdict}")
         written += [f"{axis}/{report}" for report in REPORTS]
     if not axes:
-        raise CampaignError("no axis measures anything")
+        raise CampaignError(f"no axis can be diagnosed; {'; '.join(f'{a}: {why}' for a, why in not_diagnosed.items())}")
+    for axis, reason in not_diagnosed.items():
+        print(f"gyromodel: axis {axis} was not diagnosed: {reason}", file=sys.stderr)
     lie = triad(measured, extended)
-    result = {"axes": axes, "triad": lie and lie.to_dict()}
+    result = {"axes": axes, "not_diagnosed": not_diagnosed, "triad": lie and lie.to_dict()}
     write_text(output / "axes.json", _json(result))
     return result, "\n".join([*said, *([lie.sentence()] if lie else [])]), (*written, "axes.json")
 
@@ -401,10 +410,9 @@ def _diagnose(
 
 
 def _read(paths: Sequence[Path], axis: str | None) -> list[Campaign]:
-    from gyromodel.attitude import with_reference_rates
     from gyromodel.files import read_campaign
 
-    measured = [with_reference_rates(read_campaign(path)) for path in paths]
+    measured = [read_campaign(path) for path in paths]
     return [campaign.axis(axis) for campaign in measured] if axis else measured
 
 

@@ -16,9 +16,11 @@ from jaxtyping import Array, Float
 from scipy import stats
 
 from gyromodel._checks import thermometers
-from gyromodel.averages import followed
+from gyromodel.attitude import with_reference_rates
+from gyromodel.averages import MEAN_OF_ATTITUDE, average
 from gyromodel.campaign import Campaign
 from gyromodel.effects import Signals
+from gyromodel.effects.power_cycles import BiasTurnOn
 from gyromodel.estimate import Calibration, check_covariates, validity_unit
 from gyromodel.model import GyroModel, ModelError, check_units
 from gyromodel.signals import Record, rate_output, read_signals
@@ -48,7 +50,8 @@ def compensate(campaign: Campaign, calibration: Calibration) -> Campaign:
     (metadata `rate_estimated_std_holds`); not flicker and random walk, nor that of parameters held fixed. Both columns
     are NaN where the output is missing, or where the model gives it at no rate on the branch through rest. Such
     samples, those outside the calibrated ranges and what else a user must know are counted in the metadata
-    `rate_estimated_note`. A column `rate` is not needed and not used.
+    `rate_estimated_note`. A column `rate` is not needed and not used. Rates about the other axes that the model needs
+    and the campaign lacks are those of its attitude; where that is missing, so is the estimate.
 
     Args:
         campaign: one axis, with the covariates that the model needs.
@@ -59,7 +62,10 @@ def compensate(campaign: Campaign, calibration: Calibration) -> Campaign:
         ModelError: the model needs a column that the campaign lacks, is of other units, or an effect depends on the
             rates of other samples.
     """
-    record = read_signals(campaign)
+    needed = {name for effect in calibration.model.effects for name in effect.columns_needed}
+    turned = needed & {"rate_x", "rate_y", "rate_z"} - set(campaign.columns)
+    rated = with_reference_rates(campaign)[0] if turned else campaign
+    record = read_signals(rated)
     record = record._replace(signals=record.signals | {"rate": jnp.zeros_like(record.signals["time"])})
     # What the calibration leaves open, such as which thermometers, is the campaign's; what it states stays.
     model = calibration.model.prepared(record.signals)
@@ -70,18 +76,21 @@ def compensate(campaign: Campaign, calibration: Calibration) -> Campaign:
     check_units(model, record.output_unit, record.units)
     rate, variance = _estimate(calibration, record)
     notes = _notes(campaign, calibration, record, rate, np.sqrt(variance))
-    campaign = campaign.with_column("rate_estimated", from_internal(rate, "deg/s"), "deg/s")
-    campaign = campaign.with_column("rate_estimated_std", from_internal(np.sqrt(variance), "deg/s"), "deg/s")
+    known = np.isin(campaign.columns["time"], rated.columns["time"])
+    for name, values in (("rate_estimated", rate), ("rate_estimated_std", np.sqrt(variance))):
+        column = np.full(len(campaign), np.nan)
+        column[known] = from_internal(values, "deg/s")
+        campaign = campaign.with_column(name, column, "deg/s")
     return campaign.with_metadata({
         "rate_estimated_std_holds": ", ".join(_held(calibration)) or "nothing",
         "rate_estimated_note": " ".join(notes) or None,
     })  # fmt: skip
 
 
-class ReferenceError(NamedTuple):
+class ErrorAgainstReference(NamedTuple):
     """Rms error of the estimated rate and of the output as it is, against a reference rate (deg/s).
 
-    `worse` says that the estimate errs more, beyond what the parts of the campaign differ by.
+    `worse` says that the estimate errs more: one-sided t-test, 5 %, of the mean squares over ten parts of the campaign.
     """
 
     compensated: float
@@ -89,13 +98,14 @@ class ReferenceError(NamedTuple):
     worse: bool
 
 
-def reference_error(compensated: Campaign) -> ReferenceError | None:
+def reference_error(compensated: Campaign) -> ErrorAgainstReference | None:
     """What a calibration does on a campaign that knows its rate; None where that or the output as a rate is not known.
 
     Args:
         compensated: what `compensate` returned.
     """
-    compensated, _ = followed(compensated, len(compensated))
+    rated, _ = with_reference_rates(compensated)
+    compensated, _ = average(rated, len(rated), MEAN_OF_ATTITUDE * (rated is not compensated))
     output, unit = rate_output(compensated)
     if "rate" not in compensated.columns or unit != "rad/s":
         return None
@@ -107,7 +117,7 @@ def reference_error(compensated: Campaign) -> ReferenceError | None:
     after, before = np.sqrt(np.mean(errors**2, axis=1))
     excess = [float(np.mean(part[0] ** 2 - part[1] ** 2)) for part in np.array_split(errors, PARTS, axis=1)]
     worse = np.mean(excess) > float(stats.t.ppf(0.95, PARTS - 1)) * np.std(excess, ddof=1) / np.sqrt(PARTS)
-    return ReferenceError(float(after), float(before), bool(worse))
+    return ErrorAgainstReference(float(after), float(before), bool(worse))
 
 
 def _held(calibration: Calibration) -> list[str]:
@@ -151,6 +161,13 @@ def _notes(
         margin = SURELY * np.nan_to_num(std) if name == "rate" else ROUNDING * max(abs(low), abs(high))
         if outside := int((present & ((values < low - margin) | (values > high + margin))).sum()):
             notes.append(f"{outside} of {present.sum()} samples lie outside the calibrated range of {name}, {limits}.")
+    for runs in [np.asarray(e.runs) for e in model.effects if isinstance(e, BiasTurnOn)]:
+        if other := int((present & ~np.isin(np.asarray(record.signals["run"])[: record.rows], runs)).sum()):
+            known = ", ".join(f"{r:g}" for r in runs)
+            notes.append(
+                f"{other} of {present.sum()} samples are of other runs than {known} and take the first run's bias: "
+                "what turn-ons differ by is not in rate_estimated_std."
+            )
     if timed := [e.label for e in model.effects if "time" in e.columns_needed]:
         notes.append(f"Time in {', '.join(dict.fromkeys(timed))} counts from the start of this campaign.")
     if calibration.covariance is None and model.slots():

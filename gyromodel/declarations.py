@@ -8,10 +8,14 @@ from __future__ import annotations
 
 import ast
 import inspect
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+# What the search derives of a column: its rate of change, and its value some time before. No column bears / or [.
+RATE_OF, EARLIER = "d({})/dt", "{}[earlier]"
+_DERIVED_OF = {RATE_OF: re.compile(r"d\((.+)\)/dt"), EARLIER: re.compile(r"(.+)\[earlier\]")}
 FOLDER = Path(__file__).parent / "effects"
 
 
@@ -103,3 +107,9 @@ def _parameters(node: ast.ClassDef) -> dict[str, ParameterDeclaration]:
 def column_of(label: str) -> str:
     """The column that a linear driver's id names: bias_<column>, or bias_column_<column>."""
     return label.removeprefix("bias_").removeprefix("column_")
+
+
+def measured(column: str) -> tuple[str, str]:
+    """The measured column of a driver's, and what it is of it: RATE_OF, EARLIER, or empty where it is the same."""
+    found = ((m[1], form) for form, pattern in _DERIVED_OF.items() if (m := pattern.fullmatch(column)))
+    return next(found, (column, ""))

@@ -90,7 +90,9 @@ class GyroModel(eqx.Module):
         where = max((i for i, name in enumerate(self.labels) if name == label), default=None)
         if where is None:
             raise ModelError(f"the model has no {label}")
-        return eqx.tree_at(lambda m: m.effects, self, self.effects[:where] + self.effects[where + 1 :])
+        effects = self.effects[:where] + self.effects[where + 1 :]
+        left = {e.label for e in effects}
+        return GyroModel(effects, self.noise, frozenset(key for key in self.fixed if key[0] in left), self.gyro)
 
     def columns_needed(self, effect: Effect) -> tuple[str, ...]:
         """The columns that one of the effects reads; a known scale factor serves without a rate, at rest."""

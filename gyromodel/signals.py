@@ -140,12 +140,15 @@ def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
             raise CampaignError(
                 f"{other.name}: campaigns fitted together need the same columns; {min(missing)} is in only some"
             )
+    runs = _counted_on([c.si("run") for c in campaigns]) if "run" in names else []
     parts: dict[str, list[np.ndarray]] = {}
     blocks, schemes, unit = [], set(), ""
     for campaign in campaigns:
         time = campaign.si("time")
         output, unit = rate_output(campaign)
         columns = {n: campaign.si(n) for n in names}
+        if runs:
+            columns["run"] = runs[len(blocks)]
         columns["time"] = time - time[0]
         columns["time_on"] = columns["time"] + _power_on(campaign)
         for name in thermometers(names):
@@ -164,6 +167,18 @@ def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
     units = {"campaign": ""} | {n: campaigns[0].units[n] for n in names}
     record = _pad(signals, np.concatenate(blocks), " and ".join(sorted(schemes)), unit, units)
     return record._replace(data_hash="+".join(c.digest() for c in campaigns))
+
+
+def _counted_on(runs: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """The runs of several campaigns, counted on from one to the next where two share a number."""
+    numbers = [np.unique(r[np.isfinite(r)]) for r in runs]
+    if len(np.unique(np.concatenate(numbers))) == sum(map(len, numbers)):
+        return list(runs)
+    counted, last = [], 0.0
+    for run, own in zip(runs, numbers, strict=True):
+        counted.append(run + (last + 1.0 - own[0] if len(own) and counted else 0.0))
+        last = float(np.nanmax(counted[-1], initial=last))
+    return counted
 
 
 def _check_alike(first: Campaign, other: Campaign) -> None:

@@ -10,9 +10,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import chi2
 
+from gyromodel.attitude import with_reference_rates
 from gyromodel.campaign import AXES, Campaign
 from gyromodel.effects.geometry import Misalignment
 from gyromodel.estimate import Estimate, EstimateError, fit
+from gyromodel.model import ModelError
 from gyromodel.units import factor
 
 # A rotation or a deviation from right angles is one beyond this chance.
@@ -79,7 +81,8 @@ def triad(campaigns: Sequence[Campaign], extended: Mapping[str, Estimate]) -> Tr
         campaigns: three-axis campaigns of one unit, with reference rates about all axes.
         extended: the extended fit of each axis, by its letter.
     """
-    if any(set(AXES) - set(extended) or not {f"rate_{a}" for a in AXES} <= set(c.columns) for c in campaigns):
+    rated = [with_reference_rates(c)[0] for c in campaigns]
+    if any(set(AXES) - set(extended) or not {f"rate_{a}" for a in AXES} <= set(c.columns) for c in rated):
         return None
     lean, covariance = np.zeros((3, 3)), np.zeros((9, 9))
     for i, axis in enumerate(AXES):
@@ -90,7 +93,7 @@ def triad(campaigns: Sequence[Campaign], extended: Mapping[str, Estimate]) -> Tr
             model = model.without("misalignment")
         try:
             fitted = fit([c.axis(axis) for c in campaigns], model.with_effect(Misalignment(about=about)))
-        except EstimateError:
+        except (EstimateError, ModelError):
             return None
         angles = fitted.propagate(lambda m: m.effects[m.labels.index("misalignment")].linear())
         lean[i, others] = angles.value

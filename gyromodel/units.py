@@ -156,6 +156,11 @@ def parse(text: str) -> Any:
     return units.Unit(units.UnitsContainer(powers))
 
 
+def is_angle(text: str) -> bool:
+    """Whether a unit is one of an angle, so that a column in it may wrap round."""
+    return internal_unit(text) == "rad"
+
+
 @lru_cache
 def internal_unit(text: str) -> str:
     """The internal unit of a unit text: `deg/h` gives `rad/s`, `degF` gives `degC`, dimensionless gives `""`."""

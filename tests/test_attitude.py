@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gyromodel._checks import CampaignError
 from gyromodel.attitude import body_rates, with_reference_rates
 from gyromodel.campaign import Campaign
+from gyromodel.compensation import compensate, reference_error
+from gyromodel.estimate import fit
+from gyromodel.model import model_from_effects
 
 STEP, FINER = 0.01, 50
 
@@ -40,28 +42,80 @@ def test_rates_are_those_of_the_motion():
     assert np.abs(found - rate)[inside].max() < 1e-4
 
 
-def test_rates_keep_the_gaps_of_the_attitude():
-    time, rate, attitude = moved(300)
-    attitude[100:120] = np.nan
-    time[200:] += 1.0
-    output = {f"output_{a}": rate[:, i] for i, a in enumerate("xyz")}
-    columns = {"time": time} | output | {f"attitude_{p}": attitude[:, i] for i, p in enumerate("wxyz")}
+def rotating(rows: int = 300, **metadata: str) -> tuple[Campaign, np.ndarray]:
+    """A three-axis gyro without errors under its attitude, or axis x of it where metadata are given; and its rates."""
+    time, rate, attitude = moved(rows)
+    outputs = {"output": rate[:, 0]} if metadata else {f"output_{a}": rate[:, i] for i, a in enumerate("xyz")}
+    columns = {"time": time} | outputs | {f"attitude_{p}": attitude[:, i] for i, p in enumerate("wxyz")}
     units = {n: "s" if n == "time" else "rad/s" if n.startswith("o") else "" for n in columns}
-    campaign = Campaign(columns, units, {"kind": "rate"})
-    found = with_reference_rates(campaign)
+    return Campaign(columns, units, {"kind": "rate"} | metadata), rate
+
+
+def without_attitude(campaign: Campaign, rows: np.ndarray) -> Campaign:
+    for name in [n for n in campaign.columns if n.startswith("attitude")]:
+        campaign = campaign.with_column(name, np.where(rows, np.nan, campaign.columns[name]), "")
+    return campaign
+
+
+def test_rates_keep_the_gaps_of_the_attitude():
+    campaign, rate = rotating()
+    row = np.arange(300)
+    time = campaign.columns["time"] + (row >= 200)
+    campaign = without_attitude(campaign.with_column("time", time, "s"), (row >= 100) & (row < 120))
+    found, said = with_reference_rates(campaign)
     left = np.r_[2:98, 122:198, 202:298]
     assert np.array_equal(found.columns["time"], time[left])
+    assert "32 rows without a rate from the attitude were left out" in said
     assert np.abs(found.columns["rate_z"] - rate[left, 2]).max() < 1e-4
     assert found.axis("x").columns["rate"] is found.columns["rate_x"]
     # What has a rate keeps it.
     rated = campaign.with_column("rate", rate[:, 0], "rad/s")
-    assert with_reference_rates(rated) is rated
+    assert with_reference_rates(rated) == (rated, "")
+
+
+def test_a_single_axis_says_which_it_is():
+    campaign, rate = rotating(axis="x")
+    found, _ = with_reference_rates(campaign)
+    assert {"rate", "rate_y", "rate_z"} == {n for n in found.columns if n.startswith("rate")}
+    assert np.abs(found.columns["rate"] - rate[2:-2, 0]).max() < 1e-4
+    three, _ = with_reference_rates(rotating()[0].axis("x"))
+    assert np.array_equal(three.columns["rate_y"], found.columns["rate_y"])
+    nameless = campaign.with_metadata({"axis": None})
+    kept, said = with_reference_rates(nameless)
+    assert kept is nameless
+    assert "metadata 'axis' does not say" in said
 
 
 @pytest.mark.parametrize(("attitude", "said"), [(2.0, "no unit quaternion"), (np.nan, "no stretch of 0.05 s")])
-def test_what_is_no_attitude_is_refused(attitude: float, said: str):
-    time = np.arange(50) * STEP
-    columns = {"time": time, "output": np.sin(time)} | {f"attitude_{p}": np.full(50, attitude) for p in "wxyz"}
-    units = dict.fromkeys(columns, "") | {"time": "s", "output": "rad/s"}
-    with pytest.raises(CampaignError, match=said):
-        with_reference_rates(Campaign(columns, units, {"kind": "rate"}))
+def test_what_is_no_attitude_is_not_used(attitude: float, said: str):
+    campaign = without_attitude(rotating(50)[0], np.ones(50, bool))
+    campaign = campaign.with_column("attitude_w", np.full(50, attitude), "")
+    campaign = campaign.with_column("attitude_x", np.full(50, 0.0 * attitude), "")
+    for name in ("attitude_y", "attitude_z"):
+        campaign = campaign.with_column(name, np.full(50, 0.0 * attitude), "")
+    kept, found = with_reference_rates(campaign)
+    assert kept is campaign
+    assert said in found
+
+
+def test_fit_takes_the_rates_and_compensate_keeps_the_rows():
+    """Every second seventh of the attitude is missing; a lean towards y needs its rates, a scale factor does not."""
+    campaign = without_attitude(rotating(700, axis="x")[0], np.arange(700) // 100 % 2 == 1)
+    lean = "misalignment"
+    for effects in (["scale_factor"], ["scale_factor", lean]):
+        estimate = fit(campaign, model_from_effects(effects))
+        assert float(estimate.model.gain()) == pytest.approx(1.0, abs=1e-3)
+        out = compensate(campaign, estimate.calibration())
+        assert len(out) == 700
+        assert set(campaign.columns) <= set(out.columns)
+        assert np.isfinite(out.columns["rate_estimated"]).sum() == (700 if lean not in effects else 4 * 96)
+        error = reference_error(out)
+        assert error is not None
+        assert error.compensated < 2e-3
+
+
+def test_an_attitude_on_few_rows_stops_nothing():
+    campaign = without_attitude(rotating(300, axis="x")[0], np.arange(300) % 10 > 0)
+    estimate = fit(campaign, model_from_effects(["bias"]))
+    assert estimate.record.rows == 300
+    assert len(compensate(campaign, estimate.calibration())) == 300

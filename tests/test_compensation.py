@@ -19,6 +19,7 @@ from gyromodel.compensation import compensate
 from gyromodel.effects import Effect
 from gyromodel.effects.drivers import Bias, BiasDrift
 from gyromodel.effects.dynamics import Bandwidth, TimeDelay
+from gyromodel.effects.power_cycles import BiasTurnOn
 from gyromodel.effects.readout import LockIn
 from gyromodel.effects.scale import (
     ScaleAsymmetry,
@@ -360,3 +361,13 @@ def test_thermometers_that_the_model_leaves_open_are_the_campaign_s(rng: np.rand
     units = {"time": "s", "output": "rad/s", "temperature": "degC", "temperature_coil": "degC"}
     result = compensate(Campaign(columns | pair, units, {"kind": "rate"}), Calibration(GyroModel((effect,))))
     assert rates(result) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_run_that_was_not_fitted_is_noted():
+    turn_on = BiasTurnOn(offsets=value(0.1, 0.2), runs=value(2.0, 3.0))
+    calibration = Calibration(GyroModel((Bias(value(0.0)), turn_on)))
+    runs = np.repeat([2.0, 7.0], [3, 5])
+    campaign = bench(np.linspace(0.0, 1.0, 8)).with_column("run", runs, "")
+    compensated = compensate(campaign, calibration)
+    assert "5 of 8 samples are of other runs than 2, 3 and take the first run's bias" in note(compensated)
+    assert "other runs" not in note(compensate(campaign.select(runs == 2.0), calibration))

@@ -480,13 +480,13 @@ def test_an_unknown_shows_the_function_it_follows(rng: np.random.Generator, tmp_
     assert "driver" in [path.stem for path in write_report(unknown(rng), tmp_path)]
     diagnosis = unknown(rng)
     assert diagnosis.driver is not None
-    computed = replace(diagnosis.driver, column="temperature_rate", unit="degC/s", x=np.linspace(-0.01, 0.01, 80))
+    computed = replace(diagnosis.driver, column="d(temperature)/dt", unit="degC/s", x=np.linspace(-0.01, 0.01, 80))
     write_report(replace(diagnosis, driver=computed), tmp_path)
     text = "".join(read(tmp_path / "report.html").text)
     assert "follows temperature rate" in text
     assert "a bias that curves with temperature comes closest: alone it explains 41 % of what" in text
     assert "Most probably white rate noise" in text
-    write_report(replace(diagnosis, driver=replace(computed, column="temperature_lagged", unit="degC")), tmp_path)
+    write_report(replace(diagnosis, driver=replace(computed, column="temperature[earlier]", unit="degC")), tmp_path)
     assert "follows temperature some time before" in "".join(read(tmp_path / "report.html").text)
 
 

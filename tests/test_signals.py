@@ -239,3 +239,16 @@ def test_campaigns_that_do_not_match_are_refused(rng: np.random.Generator):
     same = read_signals([plain, campaign(time, output * 3600, "arcsec/h")])
     first, second = output_of(same)[:60], output_of(same)[60:]
     assert first == pytest.approx(second)
+
+
+def test_runs_of_several_campaigns_are_counted_on_where_they_share_a_number():
+    time, noise = np.arange(8.0), np.random.default_rng(2).standard_normal((3, 8))
+
+    def runs(*numbers: list[float]) -> list[float]:
+        record = read_signals([campaign(time, o, run=np.array(n)) for o, n in zip(noise, numbers, strict=False)])
+        return np.asarray(record.signals["run"])[: record.rows : 4].tolist()
+
+    one, two = [1.0] * 8, [1.0] * 4 + [2.0] * 4
+    assert runs(one, one, one) == [1, 1, 2, 2, 3, 3]
+    assert runs(two, two) == [1, 2, 3, 4]
+    assert runs(two, [7.0] * 8) == [1, 2, 7, 7]

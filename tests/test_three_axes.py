@@ -5,15 +5,19 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from gyromodel import cli
+from gyromodel._checks import CampaignError
 from gyromodel.campaign import Campaign
-from gyromodel.estimate import fit
+from gyromodel.diagnosis import Diagnosis, diagnose
+from gyromodel.effects.geometry import Misalignment
+from gyromodel.estimate import EstimateError, fit
 from gyromodel.files import write_campaign
-from gyromodel.model import model_from_effects
+from gyromodel.model import GyroModel, model_from_effects
 from gyromodel.three_axes import Triad, triad
 
 ARCSEC = np.deg2rad(1 / 3600)
@@ -88,3 +92,43 @@ def test_diagnose_takes_all_axes_of_a_campaign(
     assert "Axis y: Your simulation lacks" in said
     assert "900" in said or "899" in said or "901" in said
     assert (tmp_path / "out" / "x" / "report.html").exists()
+
+
+def test_a_lean_that_was_fixed_is_fitted_anew():
+    campaign = measured(np.eye(3), np.random.default_rng(4))
+    known = Misalignment(angles=jnp.array([400 * ARCSEC]), about=("rate_y",))
+    lean = frozenset({("misalignment", "angles")})
+    fixed = GyroModel((*model_from_effects(["scale_factor", "bias"]).effects, known), fixed=lean)
+    assert not fixed.without("misalignment").fixed
+    extended = {a: fit(campaign.axis(a), model_from_effects(["scale_factor", "bias"])) for a in "yz"}
+    found = triad([campaign], extended | {"x": fit(campaign.axis("x"), fixed)})
+    assert found is not None
+    assert not found.oblique
+
+
+def test_axes_without_a_cross_rate_have_no_lie():
+    campaign = measured(np.eye(3), np.random.default_rng(4))
+    extended = {a: fit(campaign.axis(a), model_from_effects(["bias"])) for a in "xyz"}
+    gap = np.where(np.arange(ROWS) == 7, np.nan, campaign.columns["rate_y"])
+    assert triad([campaign.with_column("rate_y", gap, "deg/s")], extended) is None
+
+
+def test_an_axis_that_cannot_be_diagnosed_leaves_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    campaign = measured(np.eye(3), np.random.default_rng(4))
+    campaign = campaign.with_column("output_y", np.zeros(ROWS), "deg/s")
+    x_only = campaign.axis("x")
+
+    def only_x(alone: list[Campaign], model: Path, output: Path, **_) -> tuple[Diagnosis, str]:
+        if output.name != "x":
+            raise EstimateError("the fit did not converge")
+        (tmp_path / "x").mkdir(exist_ok=True)
+        return diagnosis, "Nothing is missing."
+
+    diagnosis = diagnose(x_only, model_from_effects(["scale_factor", "bias"]), hold_out=False)
+    monkeypatch.setattr(cli, "_diagnose", only_x)
+    found, said, _ = cli._diagnose_axes([campaign], tmp_path / "model.yaml", tmp_path, 0, 0)
+    assert (list(found["axes"]), found["triad"], said) == (["x"], None, "Axis x: Nothing is missing.")
+    assert found["not_diagnosed"]["z"] == "the fit did not converge"
+    assert "measures nothing" in found["not_diagnosed"]["y"]
+    with pytest.raises(CampaignError, match="there is no axis 'x'"):
+        cli._diagnose_axes([campaign, x_only], tmp_path / "model.yaml", tmp_path, 0, 0)

@@ -8,11 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from gyromodel._checks import accelerations, along_axes, thermometers
+from gyromodel.attitude import COLUMNS
 from gyromodel.campaign import Campaign
+from gyromodel.diagnosis._drivers import NOT_DRIVERS
+from gyromodel.effects.geometry import cross_rates
 from gyromodel.units import from_internal
 
 # Columns that a test cannot step by themselves.
-NOT_SET = ("segment", "run", "position", "rate", "rate_spin", "rate_output", "azimuth")
+NOT_SET = (*NOT_DRIVERS, *COLUMNS, "rate", "rate_spin", "rate_output", "azimuth")
 # Rates (rad/s) up to which the Earth alone turns the gyro, and to which a table turns it about another axis.
 EARTH, FAST = np.deg2rad(16.0 / 3600.0), np.deg2rad(10.0)
 # How many times as fast the temperature is cycled, and how often up and down at least.
@@ -33,8 +36,7 @@ def added_tests(campaign: Campaign) -> Iterator[AddedTest]:
     yield AddedTest("Repeat the run.", campaign)
     if "temperature" in campaign.columns and np.ptp(campaign.columns["temperature"]) > 0:
         yield from _thermal(campaign)
-    cross = along_axes("rate", campaign.columns)
-    yield from _turned(campaign, cross)
+    yield from _turned(campaign, cross_rates(campaign.columns))
     if "rate" in campaign.columns and np.ptp(campaign.columns["rate"]) > 0 and not _at_rest(campaign):
         rate = campaign.columns["rate"]
         yield AddedTest("Run the same rates with their signs reversed.", _with(campaign, rate=-rate))
@@ -42,11 +44,10 @@ def added_tests(campaign: Campaign) -> Iterator[AddedTest]:
     if "azimuth" in campaign.columns:
         turned = campaign.columns["azimuth"] + from_internal(np.pi / 2, campaign.units["azimuth"])
         yield AddedTest("Turn the gyro by 90° in azimuth and repeat.", _with(campaign, azimuth=turned))
+    columns = campaign.columns
+    kept = {*NOT_SET, *along_axes("rate", columns), *thermometers(columns), *accelerations(columns)}
     for name in campaign.covariates:
-        if (
-            name in (*NOT_SET, *cross, *thermometers(campaign.columns), *accelerations(campaign.columns))
-            or not np.ptp(campaign.columns[name]) > 0
-        ):
+        if name in kept or not np.ptp(campaign.columns[name]) > 0:
             continue
         still = {
             other: np.full(len(campaign), np.median(campaign.columns[other]))

@@ -34,6 +34,8 @@ OWNERS = (
     | {f"magnetic_field_{axis}": "bias_magnetic" for axis in "xyz"}
     | {f"rate_{axis}": "misalignment" for axis in "xyz"}
 )
+# Before the name of an effect that is searched, but not in all its forms.
+PART_OF = "part of "
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ def build_bank(record: Record) -> Bank:
             if name != "bias_column":
                 not_testable[name] = "needs a column rate"
             continue
-        reason = _missing(kind, record)
+        reason = _missing(kind, record, signals)
         if reason:
             not_testable[name] = reason
         elif kind.scan and np.asarray(record.sampling.restart).sum() > 1:
@@ -106,7 +108,7 @@ def build_bank(record: Record) -> Bank:
             if not forms:
                 not_testable[name] = kind.untested
             elif part := kind.hidden(signals):
-                not_testable[f"part of {name}"] = part
+                not_testable[PART_OF + name] = part
             blocks.extend((name, "effect", _weighted(e, signals, rate), e) for e in forms)
     for name in record.signals:
         reason = "" if is_no_driver(name) else unusable(record, name)
@@ -139,13 +141,13 @@ def _structure(name: str, effect: Effect | None, width: int) -> str:
     return f"{name}/{shapes}/{getattr(effect, 'powers', '')}"
 
 
-def _missing(kind: type[Effect], record: Record) -> str:
-    usable = _usable(record)
+def _missing(kind: type[Effect], record: Record, usable: Signals) -> str:
     for name in kind.needs:
         if lacking((name,), usable):
             return f"needs a column {name}" + (f" in a unit like {usual_unit(name)}" if name in record.signals else "")
-        if name in record.signals and (reason := unusable(record, name)):
-            return reason
+        reasons = [unusable(record, n) for n in name.split(" or ") if n in usable]
+        if reasons and all(reasons):
+            return " and ".join(reasons)
     return ""
 
 

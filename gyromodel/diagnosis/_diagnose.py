@@ -8,7 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from gyromodel.averages import average, followed
+from gyromodel.attitude import with_reference_rates
+from gyromodel.averages import MEAN_OF_ATTITUDE, MOST_TURN, average, turning
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores
@@ -91,16 +92,19 @@ def diagnose(
     if 0 < calibrate < FEWEST_DRAWS:
         raise ValueError(f"{calibrate} draws cannot show a 99 % point: calibrate with {FEWEST_DRAWS} or more, or 0")
     say = progress or (lambda line, done: None)
-    given = [campaigns] if isinstance(campaigns, Campaign) else list(campaigns)
+    measured = [campaigns] if isinstance(campaigns, Campaign) else list(campaigns)
+    given, of_attitude = zip(*(with_reference_rates(c) for c in measured), strict=True)
     campaigns = [at_rest(c) for c in given]
-    findings = [
+    findings = [line for line in of_attitude if line]
+    findings += [
         f"{len(np.unique(posed.columns['position']))} static poses were found in {c.name}; {len(c) - len(posed)} rows "
         "in motion were left out."
         for c, posed in zip(given, campaigns, strict=True)
         if posed is not c
     ]
     shortened = [
-        followed(c) if c is g else average(c, seconds=MEAN_OF_POSE) for c, g in zip(campaigns, given, strict=True)
+        average(c, seconds=MEAN_OF_POSE if c is not g else MEAN_OF_ATTITUDE * (g is not m))
+        for c, g, m in zip(campaigns, given, measured, strict=True)
     ]
     if any(m > 1 for _, m in shortened):
         most = max(m for _, m in shortened)
@@ -108,6 +112,8 @@ def diagnose(
             f"Means of {most} consecutive samples were searched: lines above their sample rate and quantisation are "
             "averaged away."
         )
+    far = dict.fromkeys(n for c, (_, m) in zip(campaigns, shortened, strict=True) for n in turning(c, m))
+    findings += [f"{n} turns by more than {MOST_TURN:g} deg within a mean, which weakens what follows it." for n in far]
     findings += [
         f"The first {len(c)} of {len(g)} rows were searched: means tell nothing of the feedback ramp's codes."
         for g, (c, m) in zip(campaigns, shortened, strict=True)
@@ -154,11 +160,12 @@ def diagnose(
     judgement = judge(record, session.scanner, baseline, selection, extended, len(bank.names()), nulls)
     next_test = judgement.next_test
     if judgement.verdict == "ambiguous":
-        measured = [c for c, _ in shortened]
-        next_test = settling_test(measured, baseline.model, extended, list(judgement.credible_set)) or next_test
+        searched = [c for c, _ in shortened]
+        next_test = settling_test(searched, baseline.model, extended, list(judgement.credible_set)) or next_test
     gain = not_measured(unit) if not hold_out else _gain(session, baseline, selection, unit, scale, weights, say)
     driver = driver_shape(session.scanner, selection, judgement.driver, unit) if judgement.driver else None
     say("done", 1.0)
+    rankings = [*(f.ranking for f in selection.path), selection.last]
     whole = shortened[0][0] if len(shortened) == 1 else _together([c for c, _ in shortened])
     before, after = (np.asarray(e.model.predict(record.signals))[: record.rows] for e in (baseline, extended))
     slopes = [np.asarray(e.model.slope(record.signals))[: record.rows] for e in (baseline, extended)]
@@ -183,7 +190,7 @@ def diagnose(
         threshold=session.threshold,
         threshold_kind="calibrated" if calibrate else "safe",
         p_value=_p_value(selection, nulls) if calibrate else None,
-        searched=(*bank.names(), *selection.last.tangents),
+        searched=tuple(dict.fromkeys([*bank.names(), *(name for r in rankings for name in r.tangents)])),
         campaign=whole,
         predicted_before=from_internal(before, output_unit),
         predicted_after=from_internal(after, output_unit),

@@ -1,7 +1,7 @@
 """What an unknown discrepancy may follow: columns, their rates, what they were before, and time, as smooth functions.
 
-A driver's name is "smooth(a)" or "smooth(a, b)"; a_rate stands for the rate of column a, a_lagged for its value some
-time before.
+A driver's name is "smooth(a)" or "smooth(a, b)"; d(a)/dt stands for the rate of column a, a[earlier] for its value
+some time before.
 """
 
 from __future__ import annotations
@@ -11,7 +11,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from gyromodel._checks import DERIVED
+from gyromodel.declarations import EARLIER, RATE_OF, measured
 from gyromodel.signals import Record, thermometer_rate
+from gyromodel.units import is_angle
 
 # Length scales of the smooth functions, as parts of the driver's range.
 SMOOTH_SCALES = (0.08, 0.2, 0.5)
@@ -47,7 +49,9 @@ def smooths(record: Record) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     names = driver_names(record)
     for name in (*names, "time"):
         yield from _of_one(record, f"smooth({name})", np.asarray(record.signals[name]))
-    for name in (n for n in names if n != "rate" and n != "campaign" and _slow(record, n)):
+    for name in (n for n in names if n not in ("rate", "campaign") and _slow(record, n)):
+        if is_angle(record.units[name]):
+            continue  # it may wrap round, which is no rate of change
         for derived, values in _history(record, name):
             yield from _of_one(record, f"smooth({derived})", values)
     rate_first = sorted(names, key=lambda n: n not in ("rate", "temperature"))[:3]
@@ -66,11 +70,9 @@ def smooth_columns(name: str) -> tuple[str, ...]:
 
 def driver_unit(record: Record, column: str) -> str:
     """The file's unit of a driver's column."""
-    if column in record.units:
-        return record.units[column]
-    base = column.removesuffix("_rate").removesuffix("_lagged")
+    base, form = measured(column)
     unit = record.units.get(base, "s")
-    return f"{unit or '1'}/s" if column.endswith("_rate") else unit
+    return f"{unit or '1'}/s" if form == RATE_OF else unit
 
 
 def _of_one(record: Record, name: str, values: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
@@ -104,9 +106,9 @@ def _history(record: Record, name: str) -> Iterator[tuple[str, np.ndarray]]:
     rate = np.asarray(record.signals.get(f"{name}_rate", np.zeros(0)))[: record.rows]
     rate = rate if rate.size else thermometer_rate(record, values)
     if np.isfinite(rate).all() and np.ptp(rate) > 0:
-        yield f"{name}_rate", np.pad(rate, extra, mode="edge")
+        yield RATE_OF.format(name), np.pad(rate, extra, mode="edge")
     runs = _runs(record)
     span = max(float(np.ptp(time[rows])) for rows in runs)
     for lag in LAGS:
         before = np.concatenate([np.interp(time[rows] - lag * span, time[rows], values[rows]) for rows in runs])
-        yield f"{name}_lagged", np.pad(before, extra, mode="edge")
+        yield EARLIER.format(name), np.pad(before, extra, mode="edge")

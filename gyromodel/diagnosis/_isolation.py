@@ -12,7 +12,7 @@ import numpy as np
 
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._added_tests import added_tests
-from gyromodel.diagnosis._bank import build_bank
+from gyromodel.diagnosis._bank import PART_OF, build_bank
 from gyromodel.diagnosis._evidence import SAFE_THRESHOLD, explained_for
 from gyromodel.diagnosis._ranking import skipped
 from gyromodel.effects import CATALOGUE, Effect, Signals
@@ -276,8 +276,9 @@ def _sizes(
         forms["bias_step"] = [BiasStep(epoch=jnp.asarray(t)) for t in epochs]
     left = {name: view.columns_of(effects) for name, effects in forms.items()}
     whole = {name: view.columns_of(effects, whole=True) for name, effects in forms.items()}
-    not_testable = dict(bank.not_testable)
-    for name in [n for n in not_testable if n in CATALOGUE and CATALOGUE[n].continuing(model.effects) is not None]:
+    not_testable = {name.removeprefix(PART_OF): reason for name, reason in bank.not_testable.items()}
+    untested = [n for n, reason in not_testable.items() if n in CATALOGUE and reason == CATALOGUE[n].untested]
+    for name in [n for n in untested if CATALOGUE[n].continuing(model.effects) is not None]:
         not_testable[name] = "continues an effect of the model, at sizes that only data show: it is not sized before"
     for name in list(left):
         pairs = zip(left[name], whole[name], strict=True)

@@ -86,9 +86,9 @@ class Gain:
 class Driver:
     """The smooth function of one column (or of time) that an unknown discrepancy follows, with its standard error.
 
-    `column` may end in _rate (its rate of change) or _lagged (its value some time before). `nearest` is the catalogue
-    effect that comes closest, `nearest_share` what part of the curve's work it does, `behind` by how many nats of
-    evidence it is beaten.
+    `column` is a column a, d(a)/dt (its rate of change) or a[earlier] (its value some time before). `nearest` is the
+    catalogue effect that comes closest, `nearest_share` what part of the curve's work it does, `behind` by how many
+    nats of evidence it is beaten.
     """
 
     column: str

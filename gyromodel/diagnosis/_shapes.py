@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
+from gyromodel.diagnosis._bank import PART_OF
 from gyromodel.diagnosis._drivers import driver_unit, smooth_columns
 from gyromodel.diagnosis._evidence import explained_for
 from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise, skipped
@@ -170,10 +171,11 @@ def _in_unit(scanner: Scanner, name: str, effect: Effect | None, q: int, size: f
 
 
 def not_testable(scanner: Scanner, ranking: Ranking, model: GyroModel) -> dict[str, str]:
-    """Candidates that a campaign cannot show, and those whose columns vanish beside a model, with the reason."""
+    """Candidates that a campaign cannot show, wholly or in part, and those that vanish beside a model, with reasons."""
     result = ranking.results[ranking.best_cell()]
     tried = {b.name for b in scanner.bank.blocks if b.kind == "effect"} | set(ranking.tangents)
-    reasons = {k: v for k, v in scanner.bank.not_testable.items() if k not in (*tried, *model.labels)}
+    known = (*tried, *model.labels)
+    reasons = {k.removeprefix(PART_OF): v for k, v in scanner.bank.not_testable.items() if k not in known}
     return reasons | {
         name: "cannot be told from what the model already has on this campaign"
         for name in tried - skipped(model, scanner.record.signals)

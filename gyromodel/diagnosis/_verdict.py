@@ -8,6 +8,7 @@ from math import comb
 import numpy as np
 from scipy import stats
 
+from gyromodel.declarations import EARLIER, RATE_OF, measured
 from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise
 from gyromodel.diagnosis._result import Cause, Confuser, ParameterValue, Verdict
@@ -61,7 +62,7 @@ def credible(
     too_close = name in SLOW_IN_TIME and statistic < TIME_MARGIN and ranking.slow_noise
     if name not in ("outliers", "bias_step", "bias_periodic") and not is_noise(name):
         # Only the number of forms and coefficients sets them apart, which is no evidence.
-        own |= dict.fromkeys(ranking.twins(name) & own.keys(), own[name])
+        own |= {k: max(own[k], own[name]) for k in ranking.twins(name) & own.keys()}
     if runs < 2 and (hidden_by_walk or too_close):
         own["noise_random_walk"] = max(0.0, statistic - 1.0)
     top = max(own.values())
@@ -140,13 +141,13 @@ def judge(
     unexplained = {" and ".join(smooth_columns(driver)): share} if driver else {}
     if driver and (not causes or share > UNKNOWN_SHARE):
         columns = smooth_columns(driver)
-        varied = dict.fromkeys(c.removesuffix("_rate").removesuffix("_lagged") for c in columns)
+        bases, forms = zip(*(measured(c) for c in columns), strict=True)
         how = "in steps up and down"
-        if any(c.endswith("_rate") for c in columns):
+        if RATE_OF in forms:
             how = "in ramps of several speeds up and down"
-        elif any(c.endswith("_lagged") for c in columns):
+        elif EARLIER in forms:
             how = "in steps held until nothing changes any more"
-        test = f"Vary {' and '.join(varied)} alone, {how}, everything else held, and repeat the run."
+        test = f"Vary {' and '.join(bases)} alone, {how}, everything else held, and repeat the run."
         return Judgement("unknown", tuple(causes), {driver: 1.0}, driver, test, unexplained, tuple(findings))
     if not causes and selection.remains:
         return Judgement("unknown", (), {selection.remains: 1.0}, None, None, unexplained, tuple(findings))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Iterable
 from typing import Self
 
 import equinox as eqx
@@ -14,16 +15,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from gyromodel._checks import along_axes
+from gyromodel._checks import CampaignError, along_axes
 from gyromodel.effects._base import Effect, Signals, parameter, stack
 
 # Harmonics of the table angle that are searched.
 HARMONICS = (1, 2, 3, 4)
 
 
-def cross_rates(signals: Signals) -> list[str]:
-    """The rates about the two axes across the input axis, by column; those of the two other axes of three."""
-    return along_axes("rate", signals)
+def cross_rates(names: Iterable[str]) -> list[str]:
+    """The rates about the axes across the input axis among some columns; of x, y and z, those of no more than two."""
+    found = [name for name in along_axes("rate", names) if name != "rate_input"]
+    return found if len(found) < 3 else []
 
 
 def angle_column(signals: Signals, *names: str) -> str:
@@ -49,7 +51,7 @@ class Misalignment(Effect):
     needs = ("rate_spin or rate_output or rate_x or rate_y or rate_z",)
     cause = "The input axis is not where the mounting faces say, so that rates about the other axes are sensed."
     test = "Turn about the other axes at rates far above the Earth's: what follows specific force stays as it is."
-    untested = "the rates about the other axes do not vary"
+    untested = "the rates about the other axes do not vary, or of x, y and z it is not known which is the input axis"
 
     angles: Float[Array, " axis"] = parameter("arcsec", 60.0, "lean of the input axis towards each axis", default=())
     about: tuple[str, ...] = eqx.field(static=True, default=("",))
@@ -73,8 +75,15 @@ class Misalignment(Effect):
 
     def prepared(self, signals: Signals) -> Self:
         """Take all cross rates that vary."""
+        if any(self.about):
+            return self
         names = cross_rates(signals)
-        return self if any(self.about) else type(self)(about=tuple(varying(signals, names) or names[:1]))
+        if not names:
+            raise CampaignError(
+                "misalignment: it is not known which of rate_x, rate_y and rate_z is about the input axis: name the "
+                "others in the model, as about: [rate_x, rate_y]"
+            )
+        return type(self)(about=tuple(varying(signals, names) or names[:1]))
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:

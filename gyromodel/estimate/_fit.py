@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gyromodel.averages import followed
+from gyromodel.attitude import with_reference_rates
+from gyromodel.averages import MEAN_OF_ATTITUDE, average
 from gyromodel.campaign import Campaign
 from gyromodel.estimate._estimate import Estimate, EstimateError, noise_coefficients
 from gyromodel.estimate._optimistix import optimistix_solution
@@ -71,7 +72,9 @@ def fit(
         ModelError: the model needs columns the campaign lacks.
     """
     campaigns = [campaigns] if isinstance(campaigns, Campaign) else campaigns
-    record = read_signals([followed(at_rest(c), len(c))[0] for c in campaigns])
+    rated = [with_reference_rates(c)[0] for c in campaigns]
+    means = [MEAN_OF_ATTITUDE * (r is not c) for r, c in zip(rated, campaigns, strict=True)]
+    record = read_signals([average(at_rest(r), len(r), s)[0] for r, s in zip(rated, means, strict=True)])
     if progress:
         progress("fitting", 0.1)
     estimate = with_noise_intervals(fit_record(record, model, solver=solver))

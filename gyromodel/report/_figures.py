@@ -78,7 +78,7 @@ def _figures(diagnosis: Diagnosis) -> Figures:
     known = {a.key: a for a in drivers}
     causes = {key for cause in diagnosis.causes for key in follows(cause.effect, known)}
     if diagnosis.driver is not None:
-        causes |= {key_of(column.strip(), known) for column in diagnosis.driver.column.split(",")}
+        causes |= {key_of(column.strip()) for column in diagnosis.driver.column.split(",")}
     moved = swept(diagnosis.campaign, diagnosis.residual_before, diagnosis.rate_unit)
     if moved:
         rate = Abscissa("rate", "input rate", diagnosis.campaign.units["rate"], diagnosis.campaign.columns["rate"])
@@ -298,7 +298,7 @@ def _column(diagnosis: Diagnosis, known: dict[str, Abscissa]) -> np.ndarray | No
     assert driver is not None
     if driver.column in campaign.columns:
         return np.asarray(campaign.in_unit(driver.column, driver.unit), float)
-    computed = known.get(key_of(driver.column, known))
+    computed = known.get(key_of(driver.column))
     return None if computed is None else computed.values * _factor(computed.unit, driver.unit)
 
 

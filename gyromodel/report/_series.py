@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gyromodel.declarations import column_of
+from gyromodel.declarations import RATE_OF, column_of, measured
 from gyromodel.report._words import spoken
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def abscissae(diagnosis: Diagnosis) -> tuple[list[Abscissa], list[str]]:
     found |= _derived(campaign, found) | _folded(diagnosis)
     causes = [key for cause in diagnosis.causes for key in follows(cause.effect, found)]
     if diagnosis.driver is not None:
-        causes += [key_of(column.strip(), found) for column in diagnosis.driver.column.split(",")]
+        causes += [key_of(column.strip()) for column in diagnosis.driver.column.split(",")]
     if any(cause.points for cause in diagnosis.causes):
         causes.append("rate")
     shares = {key: explained(a.values, diagnosis.residual_before) for key, a in found.items()}
@@ -93,10 +93,10 @@ def follows(effect: str, known: Mapping[str, Abscissa]) -> list[str]:
     return [key for key in known if key in keys or any(key.startswith(f"{k}:") for k in keys if ":" in k)]
 
 
-def key_of(column: str, known: Mapping[str, Abscissa]) -> str:
+def key_of(column: str) -> str:
     """The key of a driver's column, which may be a rate of change computed by the search."""
-    base = column.removesuffix("_rate")
-    return column if column in known or f"{base}:rate" not in known else f"{base}:rate"
+    base, form = measured(column)
+    return f"{base}:rate" if form == RATE_OF else column
 
 
 def time_axis(campaign: Campaign) -> Abscissa:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from gyromodel.declarations import column_of
+from gyromodel.declarations import EARLIER, RATE_OF, column_of, measured
 
 PHRASES = {
     "scale_factor": "a scale-factor error",
@@ -72,9 +72,9 @@ def driver_name(text: str) -> str:
 
 
 def _driven(column: str) -> str:
-    if column.endswith("_lagged"):
-        return f"{spoken(column.removesuffix('_lagged'))} some time before"
-    return _DRIVERS.get(column, spoken(column))
+    base, form = measured(column)
+    after = {RATE_OF: " rate", EARLIER: " some time before"}.get(form, "")
+    return _DRIVERS.get(base, spoken(base)) + after
 
 
 def phrase(effect: str, kind: str = "effect") -> str:

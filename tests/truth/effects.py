@@ -219,8 +219,8 @@ UNKNOWN: dict[str, tuple[Effect, tuple[str, ...]]] = {  # effect and the columns
     "pressure_bump": (pressure_bump, ("pressure",)),
     "pressure_switch": (pressure_switch, ("pressure",)),
     "rate_temperature_bump": (rate_temperature_bump, ("rate", "temperature")),
-    "temperature_rate_switch": (temperature_rate_switch, ("temperature_rate",)),
-    "buried_temperature_ripple": (buried_temperature_ripple, ("temperature_lagged",)),
+    "temperature_rate_switch": (temperature_rate_switch, ("d(temperature)/dt",)),
+    "buried_temperature_ripple": (buried_temperature_ripple, ("temperature[earlier]",)),
 }
 
 SCANS = ("bias_step", "bias_periodic", *UNKNOWN)  # effects that are searched for over many positions

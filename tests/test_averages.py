@@ -1,0 +1,51 @@
+"""Means of samples that turn: angles against the cosines and sines of their own samples."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gyromodel._checks import CampaignError
+from gyromodel.averages import average, turning
+from gyromodel.campaign import Campaign
+
+ROWS = 1000
+
+
+def turned(speed: float, unit: str = "deg") -> Campaign:
+    """A table that turns by some degrees a sample, its angle from 0 to 360; the gyro senses the angle's cosine."""
+    angle = speed * np.arange(ROWS) % 360.0
+    columns = {"time": np.arange(ROWS) * 1.0, "output": np.cos(np.deg2rad(angle)), "azimuth": angle}
+    return Campaign(columns, {"time": "s", "output": "deg/h", "azimuth": unit}, {"kind": "rate"})
+
+
+@pytest.mark.parametrize("speed", [1.1, 6.1])
+def test_an_angle_keeps_its_direction_across_its_wrap(speed: float):
+    short, together = average(turned(speed), 200)
+    assert together == 5
+    mean = np.cos(np.deg2rad(short.columns["azimuth"]))
+    # A mean of five cosines is as much shorter as a chord of the turn: one number for all.
+    ratio = np.sin(5 * np.deg2rad(speed) / 2) / (5 * np.sin(np.deg2rad(speed) / 2))
+    assert np.abs(short.columns["output"] - ratio * mean).max() < 1e-9
+
+
+def test_an_angle_that_stands_or_never_wraps_has_its_plain_mean():
+    still = turned(1.1).with_column("azimuth", np.full(ROWS, 200.1), "deg")
+    assert (average(still, 200)[0].columns["azimuth"] == 200.1).all()
+    missing = still.with_column("azimuth", np.where(np.arange(ROWS) < 7, np.nan, 3600.0 + np.arange(ROWS)), "deg")
+    found = average(missing, 200)[0].columns["azimuth"]
+    assert np.isnan(found[0])
+    assert found[1:3] == pytest.approx([3608.0, 3612.0])
+
+
+def test_angles_that_turn_far_within_a_mean_are_told():
+    assert turning(turned(6.1), 5) == ["azimuth"]
+    assert turning(turned(1.1), 5) == []
+    assert turning(turned(6.1), 1) == []
+
+
+def test_three_axes_of_increments_are_asked_to_choose_one():
+    columns = {"time": np.arange(ROWS) * 1.0} | {f"output_{a}": np.sin(np.arange(ROWS)) for a in "xyz"}
+    campaign = Campaign(columns, {n: "s" if n == "time" else "arcsec" for n in columns}, {"kind": "increment"})
+    with pytest.raises(CampaignError, match="choose one axis"):
+        average(campaign, 200)
