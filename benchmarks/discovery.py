@@ -73,7 +73,7 @@ def _row(v: levels.Level) -> str:
     low, high = v.interval
     must = f"{'≥' if v.at_least else '≤'} {100 * v.must:.1f} %"
     measured = f"{100 * v.share:.1f} % ({100 * low:.1f}-{100 * high:.1f})"
-    verdict = "met" if v.met else "**missed**"
+    verdict = ("met" if v.met else "**missed**") if v.total else "not measured"
     return f"| {v.row} | {v.measure} | {v.prototype} | {must} | {measured} | {v.total} | {verdict} |"
 
 
