@@ -39,6 +39,9 @@ def _signals(name: str, design: Design) -> Array:
     match name:
         case "scale_nonlinearity":
             return np.stack([error(name, design, 1.0, {"mix": row}) for row in np.eye(4)], axis=-1)[:, None]
+        case "time_delay" | "bandwidth":
+            sizes = design.step * np.geomspace(0.03, 5.0, 12)
+            return np.stack([error(name, design, size, {}) / size for size in sizes], axis=1)[:, :, None]
         case "bias_periodic":
             angle = 2 * np.pi * np.outer(time, np.arange(4 / span, 0.22 / design.step, 1 / (4 * span)))
             return np.stack([np.sin(angle), np.cos(angle)], axis=-1)

@@ -17,7 +17,7 @@ RAMP_CODES = 4096  # of a closed loop's ramp converter
 
 @dataclass(frozen=True)
 class Design:
-    """A campaign plan as lived: measured columns in file units, true columns in SI with degC."""
+    """A campaign plan as lived: measured columns in file units, true ones in SI with degC, g and gauss."""
 
     name: str
     step: float  # s
@@ -27,7 +27,7 @@ class Design:
     metadata: dict[str, str | int | float]
     true: dict[str, Array]
     thermal: tuple[Array, Array]  # fine time, temperature
-    grade: float = 1.0  # of the gyro's noise, beside a usual one's
+    white: tuple[float, float] = (-2.5, -0.5)  # decades of the gyro's angle random walk, deg/sqrt(h)
     motion: Mapping[str, Any] | None = None  # rates by axis as functions of time, where they are known between samples
 
     @property

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import beta, binom, kstest
 
+from .campaigns import TESTABLE
 from .noise import FAMILY, OUTSIDE
 from .study import SLOW, Record
-from .verdicts import Score
+from .verdicts import Score, allowed
+
+TAIL = 0.0062  # beyond 2.5 standard errors
 
 
 @dataclass(frozen=True)
@@ -44,10 +48,19 @@ class Level:
     @property
     def plausible(self) -> bool:
         """Not worse than the level loosened by 2.5 standard errors: for small samples."""
-        tail = 0.0062
+        return self.count >= self.limit if self.at_least else self.count <= self.limit
+
+    @property
+    def limit(self) -> int:
+        """The least, or the most, that is plausible."""
+        return int(binom.ppf(TAIL if self.at_least else 1 - TAIL, self.total, self.must))
+
+    @property
+    def can_fail(self) -> bool:
+        """Whether a share half as good as the level, or false alarms in a third of the cases, would mostly fail."""
         if self.at_least:
-            return bool(self.count >= binom.ppf(tail, self.total, self.must))
-        return bool(self.count <= binom.ppf(1 - tail, self.total, self.must))
+            return bool(binom.cdf(self.limit - 1, self.total, 0.5 * self.must) > 0.5)
+        return bool(binom.sf(self.limit, self.total, 1 / 3) > 0.5)
 
 
 def _scores(records: list[Record]) -> list[Score]:
@@ -58,18 +71,58 @@ def _level(row: str, measure: str, prototype: str, must: float, at_least: bool, 
     return Level(row, measure, prototype, must, at_least, sum(flags), len(flags))
 
 
+def pooled(levels: list[Level]) -> list[Level]:
+    """One level for each row, and each direction of it: the counts together, against the mean of what they must reach.
+
+    The scatter is then no larger than that of the binomial law.
+    """
+    groups = defaultdict(list)
+    for v in levels:
+        groups[v.row, v.at_least].append(v)
+    found = []
+    for (row, at_least), group in groups.items():
+        total = sum(v.total for v in group)
+        must = sum(v.must * v.total for v in group) / max(total, 1)
+        measure = "; ".join(dict.fromkeys(v.measure for v in group))
+        found.append(Level(row, measure, "", must, at_least, sum(v.count for v in group), total))
+    return found
+
+
 def null_levels(records: list[Record]) -> list[Level]:
-    """Rows 1, 2 and 15 from campaigns with nothing hidden."""
-    family = [r for r in records if r.case.noise in FAMILY]
-    levels = [
-        _level("1", "false extension, all noises pooled", "0-1.2 %", 0.02, False, [s.detected for s in _scores(family)])
-    ]
+    """Rows 1 and 2 from campaigns with nothing hidden."""
+    everywhere = "false extension, all noises and designs pooled"
+    levels = [_level("1", everywhere, "0-1.2 %", 0.02, False, [s.detected for s in _scores(records)])]
     for noise in (*FAMILY, *OUTSIDE):
         flags = [r.score.detected for r in records if r.score and r.case.noise == noise]
         if flags:
             levels.append(_level("2", f"false extension, {noise.replace('_', ' ')}", "≤ 7.8 %", 0.04, False, flags))
-    claimed = [s.gain_claimed for s in _scores(records)]
-    return [*levels, _level("15", "gain claimed with nothing hidden", "1-2.5 %", 0.05, False, claimed)]
+    return levels
+
+
+def claim_level(forced: list[Record]) -> Level:
+    """Row 15: the best candidate added whatever its evidence where nothing is hidden, and what it then gains."""
+    claimed = [s.gain_claimed for s in _scores(forced)]
+    return _level("15", "gain claimed for the best candidate, nothing hidden", "1-2.5 %", 0.05, False, claimed)
+
+
+def oracle_right(record: Record) -> bool:
+    """Whether the oracle's name is right, by the rule that the engine is judged by."""
+    return record.oracle_first in allowed(str(record.case.effect), record.case.design)[0]
+
+
+def surpassed(records: list[Record]) -> tuple[int, int]:
+    """Campaigns where only the engine's first name was right, and those where only the oracle's was."""
+    pairs = [(r.score.first_right, oracle_right(r)) for r in _contested(records) if r.score]
+    return sum(e and not o for e, o in pairs), sum(o and not e for e, o in pairs)
+
+
+def _contested(records: list[Record]) -> list[Record]:
+    """Isolable campaigns of effects that noise does not imitate, where the oracle has more than one name."""
+    return [r for r in _alone(records) if len(TESTABLE[r.case.design]) > 1]
+
+
+def _alone(records: list[Record]) -> list[Record]:
+    return [r for r in records if r.isolable and r.case.effect not in SLOW]
 
 
 _ROW4 = {1.0: 0.93, 3.0: 0.97}
@@ -81,20 +134,18 @@ def effect_levels(records: list[Record]) -> list[Level]:
     levels = []
     for size in sorted({r.case.times_mde for r in records}):
         group = [r for r in records if r.case.times_mde == size and r.score]
-        alone = [r for r in group if r.isolable and r.case.effect not in SLOW]
         at = f"{size:g}×"
         if size in _ROW4:
-            knew = [r.oracle_first == r.case.effect for r in alone]
-            found = [r.score.first_right for r in alone if r.score]
+            knew = [oracle_right(r) for r in _contested(group)]
+            found = [s.first_right for s in _scores(_contested(group))]
             must = _ROW4[size] * float(np.mean(knew)) if knew else 0.0
             levels.append(
-                _level("4", f"first name right ÷ oracle ({np.mean(knew):.3f}), {at}", ".97-1", must, True, found)
+                _level("4", f"first name right ÷ oracle ({_mean(knew):.3f}), {at}", ".97-1", must, True, found)
             )
         if size in _ROW5:
-            named = [r.score.named for r in alone if r.score]
-            levels.append(
-                _level("5", f"detected and named, isolable, {at}", ".56-.76/.92-.99/1", _ROW5[size], True, named)
-            )
+            named = [s.named for s in _scores(_alone(group))]
+            measure = f"detected and named, isolable, not slow in time, {at}"
+            levels.append(_level("5", measure, ".56-.76/.92-.99/1", _ROW5[size], True, named))
         if size == 3.0:
             scores = _scores(group)
             levels += [
@@ -117,12 +168,20 @@ def effect_levels(records: list[Record]) -> list[Level]:
     return levels
 
 
-def mean_set_size(records: list[Record]) -> float:
-    """Row 7: mean size of the credible set at 3 x MDE, isolable campaigns (must be under 1.5)."""
-    sizes = [
-        r.score.set_size for r in records if r.score and r.isolable and r.case.times_mde == 3.0 and r.score.detected
-    ]
-    return float(np.mean(sizes)) if sizes else float("nan")
+def _mean(values: list[bool]) -> float:
+    return float(np.mean(values)) if values else float("nan")
+
+
+SET_SIZE = 1.5
+
+
+def mean_set_size(records: list[Record]) -> tuple[float, float]:
+    """Row 7: mean size of the credible set at 3 x MDE, isolable campaigns, and its standard error."""
+    at_three = [r for r in records if r.isolable and r.case.times_mde == 3.0]
+    sizes = [s.set_size for s in _scores(at_three) if s.detected]
+    if len(sizes) < 2:
+        return float("nan"), float("nan")
+    return float(np.mean(sizes)), float(np.std(sizes, ddof=1) / np.sqrt(len(sizes)))
 
 
 def ambiguity_levels(inseparable: list[Record], drifts: list[Record]) -> list[Level]:
@@ -136,7 +195,7 @@ def ambiguity_levels(inseparable: list[Record], drifts: list[Record]) -> list[Le
             "79/80",
             0.97,
             True,
-            [not s.named for s in _scores(drifts)],
+            [r.answer.verdict != "named" for r in drifts if r.answer],
         ),
     ]
 
@@ -189,8 +248,9 @@ def amplitude_levels(records: list[Record]) -> list[Level]:
 
 def adequacy_level(records: list[Record]) -> Level:
     """Row 17: the extended model lacks nothing."""
-    after = [r.answer.adequate_after for r in records if r.answer and r.score and r.score.named]
-    return _level("17", "extended model is adequate, 3×", "–", 0.95, True, [a for a in after if a is not None])
+    after = [r.answer.adequate_after for r in records if r.answer]
+    measure = "extended model is adequate, named or ambiguous, 3×"
+    return _level("17", measure, "–", 0.95, True, [a for a in after if a is not None])
 
 
 def settled_level(inseparable: list[Record]) -> Level:
@@ -210,14 +270,20 @@ def uniform_p_values(records: list[Record]) -> tuple[float, float, int]:
     return float(kstest(p, "uniform").pvalue), float(np.mean(p <= 0.1)), len(p)
 
 
-def gain_coverage(records: list[Record]) -> Level:
-    """Row 15: in white noise the residual falls by sqrt(1 + lambda^2/n) when the right effect is added."""
+# Where positions are held out, the errors of their means count, not those of samples.
+POSITIONED = ("tumble", "one_axis_tumble")
+
+
+def gain_coverage(records: list[Record]) -> list[Level]:
+    """Row 15: in white noise the error of a sample falls by sqrt(1 + lambda^2/n) when the right effect is added."""
     hits = []
     for r in records:
-        if r.answer and r.score and r.score.named and r.case.noise == "white":
+        white = r.case.noise == "white" and r.case.design not in POSITIONED
+        if r.answer and r.score and r.score.named and white:
             _, low, high = r.answer.gain_ratio
-            hits.append(low <= np.sqrt(1 + r.size**2 / len(r.truth.noise)) <= high)
-    return _level("15", "gain interval covers the true gain, white noise (must: 88-99 %)", "–", 0.88, True, hits)
+            hits.append(bool(low <= np.sqrt(1 + r.size**2 / len(r.truth.noise)) <= high))
+    measure = "gain interval covers the true gain, white noise"
+    return [_level("15", measure, "–", 0.88, True, hits), _level("15", measure, "–", 0.99, False, hits)]
 
 
 def unknown_levels(records: list[Record]) -> list[Level]:

@@ -50,7 +50,7 @@ def bias_vibration(design: Design, amplitude: float) -> Array:
 def bias_anisoinertia(design: Design, amplitude: float) -> Array:
     """Euler's equations of a float of unequal inertia: the torque ω × (J ω) about the output axis, over H = 1."""
     inertia = np.array([1.0, 1.7, 1.0 + amplitude])
-    rates = np.column_stack([design.true["rate"], *(np.deg2rad(design.true[f"rate_{a}"]) for a in ("output", "spin"))])
+    rates = np.column_stack([design.true[name] for name in ("rate", "rate_output", "rate_spin")])
     torque = np.cross(rates, rates * inertia)
     return -torque[:, 1]
 
@@ -60,8 +60,7 @@ def misalignment(design: Design, amplitude: float, towards: tuple[float, float])
     output, spin = amplitude * np.asarray(towards)
     # Rotation by `spin` about the spin axis carries the input axis towards output, and so on.
     lean = (_about(2, output) @ _about(1, -spin))[:, 0]
-    unit = np.deg2rad(1.0) / (3600 if "turns" in design.true else 1)
-    rates = np.column_stack([design.true["rate"], *(unit * design.true[f"rate_{a}"] for a in ("output", "spin"))])
+    rates = np.column_stack([design.true[name] for name in ("rate", "rate_output", "rate_spin")])
     return rates @ (lean - np.array([1.0, 0.0, 0.0]))
 
 
@@ -132,7 +131,7 @@ MOTION_EFFECTS: dict[str, Effect] = {f"bias_acceleration_{axis}": _acceleration(
     )
 }  # fmt: skip
 # Not linear in the amplitude: the sizes among which the one for a wanted signal is found; and those without a sign.
-BRACKETS = {"time_delay": (1e-9, 0.1), "bandwidth": (1e-9, 0.1), "misalignment": (1e-9, 0.5), "table_tilt": (1e-9, 0.5)}
+BRACKETS = {"time_delay": (1e-9, 0.1), "bandwidth": (1e-9, 0.2), "misalignment": (1e-9, 0.5), "table_tilt": (1e-9, 0.5)}
 LAGS = ("time_delay", "bandwidth")
 
 

@@ -18,7 +18,9 @@ Array = np.ndarray
 EARTH = np.deg2rad(15.041067) / 3600  # rad/s
 ACCELEROMETER = 2e-5  # g
 FIELD = 0.2  # gauss, horizontal
-NAVIGATION = 0.02  # noise of a gyro that resolves the Earth's rate, beside a usual one's
+# Decades of angle random walk (deg/sqrt(h)): of a gyro that resolves the Earth's rate, and of one so noisy that a delay
+# is found only where it is a part of a sample.
+NAVIGATION, NOISY = (-4.2, -2.2), (1.0, 1.5)
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,8 @@ def _positions(name: str, attitudes: list[Array], hold: int, rng: np.random.Gene
     metadata = {"test": "multi_position", "rate_frame": "inertial", "latitude_deg": float(np.rad2deg(latitude))}
     thermal = _warm(len(turns), step, rng)
     design = _build(name, np.arange(len(turns)), step, earth[:, 0], thermal, extra, metadata, rng)
-    return replace(design, true=design.true | {"turns": turns}, grade=NAVIGATION)
+    true = {"turns": turns} | {f"rate_{axis}": earth[:, i] for i, axis in enumerate(axes) if i}
+    return replace(design, true=design.true | true, white=NAVIGATION)
 
 
 def tumble(rng: np.random.Generator) -> Design:
@@ -128,7 +131,7 @@ def _table(name: str, *, parted: bool, rng: np.random.Generator) -> Design:
     thermal = _warm(rows, step, rng)
     design = _build(name, np.arange(rows), step, rate, thermal, extra, {"test": "turntable"}, rng)
     true = design.true | {"table_angle": angle, "azimuth": azimuth, "magnetic_field": field}
-    return replace(design, true=true, grade=NAVIGATION)
+    return replace(design, true=true, white=NAVIGATION)
 
 
 def turntable(rng: np.random.Generator) -> Design:
@@ -159,7 +162,8 @@ def dynamic_rates(rng: np.random.Generator) -> Design:
     design = _build(
         "dynamic_rates", np.arange(rows), step, motion["rate"](time), thermal, extra, {"test": "rates"}, rng
     )
-    return replace(design, true=design.true | {"level": level}, motion=motion)
+    true = {"level": level} | {f"rate_{axis}": motion[axis](time) for axis in ("spin", "output")}
+    return replace(design, true=design.true | true, motion=motion, white=NOISY)
 
 
 def _mean_square(level: Array, step: float, rng: np.random.Generator) -> Array:

@@ -9,8 +9,6 @@ from unittest.mock import patch
 
 import numpy as np
 
-MUTANTS = ("no_whitening", "no_projection", "no_look_elsewhere", "forced", "forced_no_nesting")
-
 
 @contextmanager
 def mutated(name: str) -> Iterator[None]:

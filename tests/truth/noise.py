@@ -122,7 +122,7 @@ def _fractional_covariance(rows: np.ndarray, alpha: float) -> Array:
 
 def draw(kind: str, design: Design, rng: np.random.Generator) -> Noise:
     """Draw levels: white of a real gyro, coloured terms that cross it within a small part of the campaign."""
-    N = design.grade * np.deg2rad(10 ** rng.uniform(-2.5, -0.5)) / 60  # 0.003 ... 0.3 deg/sqrt(h)
+    N = np.deg2rad(10 ** rng.uniform(*design.white)) / 60
     dt = design.step
     B = N / (0.664 * np.sqrt(10 ** rng.uniform(0.7, 1.6) * dt))  # Allan curves cross at 5 ... 40 samples
     K = np.sqrt(3) * N / (10 ** rng.uniform(1.0, 1.8) * dt)  # 10 ... 60 samples

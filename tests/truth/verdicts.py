@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 from .campaigns import Truth, known
 from .mde import parts
-from .motion import LAGS
 
 
 @dataclass(frozen=True)
@@ -32,7 +31,6 @@ ACCEPTED = (
     Accepted("bias_warmup", frozenset(), True, _SLOW),
     Accepted("scale_sagnac_sine", frozenset({"scale_nonlinearity"}), True, "a sine equals a cubic to third order"),
     Accepted("bias_temperature", frozenset(), True, "temperature is a line in time on one ramp", ("static_ramp",)),
-    *(Accepted(e, frozenset(), True, "to first order both are the slope of the rate") for e in LAGS),
     *(
         Accepted(
             e,
@@ -57,7 +55,6 @@ class Answer:
     verdict: str
     causes: tuple[str, ...]
     first: str  # top of the first round's ranking, whatever the verdict
-    evidence: dict[str, float]  # of effects in the first round
     sizes: dict[str, tuple[float, float]]  # each cause's first parameter and its standard error, in SI
     noise: str  # the likeliest make-up of the noise
     p_value: float | None  # of the campaign as one with nothing hidden, where that was simulated
@@ -67,7 +64,6 @@ class Answer:
     driver: tuple[str, ...]
     gain_ratio: tuple[float, float, float]  # value, low, high
     gain_score: tuple[float, float, float]  # nats: value, low, high
-    seconds: float
 
 
 @dataclass(frozen=True)
@@ -86,7 +82,8 @@ class Score:
     gain_claimed: bool
 
 
-def _allowed(truth: str, design: str) -> tuple[frozenset[str], bool]:
+def allowed(truth: str, design: str) -> tuple[frozenset[str], bool]:
+    """The names that are right for a hidden effect, and whether a set that holds it is right on any campaign."""
     rows = [a for a in ACCEPTED if a.truth == truth and (not a.designs or design in a.designs)]
     return frozenset({truth}).union(*(a.stand_ins for a in rows)), any(a.ambiguous for a in rows)
 
@@ -95,17 +92,18 @@ def judge(truth: Truth, design: str, answer: Answer, isolable: bool = True) -> S
     """Judge an answer against what was hidden; `isolable`: whether every rival separates from it on this campaign."""
     detected, firm = answer.verdict != "adequate", answer.verdict == "named"
     names = frozenset(answer.causes)
-    members = names | frozenset(answer.credible)
+    # The set is that of the strongest cause: of two hidden effects the other is among the causes.
+    members = frozenset(answer.credible) | (names if len(parts(truth.effect)) > 1 else frozenset())
     driver_right = answer.verdict == "unknown" and set(answer.driver) == set(truth.driver or ())
     exact = in_set = False
     if truth.effect is None:
-        allowed, right = frozenset(), not detected
+        ours, right = frozenset(), not detected
     elif not known(truth.effect):
-        allowed, right = frozenset(), driver_right
+        ours, right = frozenset(), driver_right
     else:
-        each = [_allowed(part, design) for part in parts(truth.effect)]
-        allowed, tolerant = frozenset().union(*(names for names, _ in each)), any(t for _, t in each)
-        exact = firm and len(names) == len(each) and names <= allowed and all(names & a for a, _ in each)
+        each = [allowed(part, design) for part in parts(truth.effect)]
+        ours, tolerant = frozenset().union(*(names for names, _ in each)), any(t for _, t in each)
+        exact = firm and len(names) == len(each) and names <= ours and all(names & a for a, _ in each)
         in_set = all(a & members for a, _ in each)
         right = exact or (
             (tolerant or not isolable) and answer.verdict == "ambiguous" and members >= set(parts(truth.effect))
@@ -114,11 +112,11 @@ def judge(truth: Truth, design: str, answer: Answer, isolable: bool = True) -> S
         right=right,
         detected=detected,
         named=exact,
-        firm_and_wrong=firm and not names <= allowed,
+        firm_and_wrong=firm and not names <= ours,
         in_set=in_set,
         set_size=max(len(answer.credible), 1),
         called_unknown=answer.verdict == "unknown",
-        first_right=answer.first in allowed,
+        first_right=answer.first in ours,
         driver_right=driver_right,
         gain_claimed=answer.gain_score[1] > 0,
     )
