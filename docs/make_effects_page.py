@@ -22,6 +22,7 @@ NOISE_FORMS = {
     "noise_white": ("N²", "N²/τ"),
     "noise_flicker": ("B²/(2πf)", "(2 ln2/π) B²"),
     "noise_random_walk": ("K²/(2πf)²", "K² τ/3"),
+    "noise_markov": ("(q T)²/(1 + (2πf T)²)", "peak (0.437 q)² T at 1.89 T"),
 }
 HEAD = """# The effect catalogue
 
@@ -75,8 +76,11 @@ def _meaning(parameter: ParameterDeclaration) -> str:
 
 
 def _noise() -> str:
-    rows = [[f"`{name}`", unit, *NOISE_FORMS[name]] for name, unit in NOISE_UNITS.items()]
-    return f"## Noise\n\n{_table(['noise', 'unit', 'rate PSD, two-sided', 'Allan variance'], rows)}"
+    rows = [[f"`{name}`", NOISE_UNITS[name], *forms] for name, forms in NOISE_FORMS.items()]
+    table = _table(["noise", "unit", "rate PSD, two-sided", "Allan variance"], rows)
+    return (
+        f"## Noise\n\n{table}\n`noise_markov` is stated with its `time_constant` T, and not beside `noise_flicker`.\n"
+    )
 
 
 def _table(head: list[str], rows: list[list[str]]) -> str:
