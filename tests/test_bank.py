@@ -99,3 +99,10 @@ def test_the_rate_about_the_input_axis_is_no_cross_rate():
     del turns["rate_z"]
     record = read_signals(log(dict.fromkeys(turns, "deg/s"), **turns))
     assert "misalignment" in build_bank(record).names()
+
+
+def test_padding_is_no_branch_of_a_loop():
+    """The temperature turns back in the last two of 200 rows only; 24 more are padded."""
+    temperature = 20.0 + np.minimum(np.arange(ROWS), 197.0 + 20.0 * (197.0 - np.arange(ROWS)))
+    bank = build_bank(read_signals(log({"temperature": "degC"}, temperature=temperature)))
+    assert "to close a loop" in bank.not_testable["bias_thermal_hysteresis"]

@@ -43,8 +43,11 @@ class _Hysteresis(Effect):
         """Loops of which the campaign holds both branches."""
         x = np.asarray(signals[cls.driver])
         tried = [cls(half_width=w) for w in np.ptp(x) * np.geomspace(NARROWEST, WIDEST, WIDTHS)]  # type: ignore[call-arg]
-        fewest = max(FEWEST, SHARE * len(x))
-        return [e for e in tried if min(np.sum(s * np.asarray(e.columns(signals)) > 0.99) for s in (-1, 1)) >= fewest]
+        # Padded rows repeat the last one, its time too.
+        rows = np.diff(np.asarray(signals["time"]), prepend=-np.inf) != 0
+        fewest = max(FEWEST, SHARE * rows.sum())
+        branches = [np.asarray(e.columns(signals))[rows] for e in tried]
+        return [e for e, b in zip(tried, branches, strict=True) if min(np.sum(b > 0.99), np.sum(b < -0.99)) >= fewest]
 
 
 class BiasThermalHysteresis(_Hysteresis):
