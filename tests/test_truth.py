@@ -10,7 +10,7 @@ from scipy.stats import binom, binomtest, kstest, kurtosis, norm
 from scipy.stats import t as student_t
 
 from tests.truth import contest, levels, noise, study
-from tests.truth.campaigns import HOMES, LOOP, MOTION, RUNS, TESTABLE, UNCATALOGUED, A, B, C, hide
+from tests.truth.campaigns import HOMES, MOTION, RUNS, TESTABLE, UNCATALOGUED, A, B, C, hide
 from tests.truth.designs import DESIGNS, RAMP_CODES
 from tests.truth.effects import EFFECTS, UNKNOWN, coil_temperature_rate, draw_shape, error
 from tests.truth.mde import REGULAR, SCAN, amplitude, baseline, oracle, simpler, target
