@@ -16,12 +16,12 @@ from pathlib import Path
 import pytest
 
 import gyromodel
-from gyromodel import declarations
+from gyromodel import cli, declarations
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = Path(gyromodel.__file__).parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("*.md")])
+PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])
 BLOCKS = re.findall(r"^```python\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
 ROOMS = {
     name.rstrip("/").removesuffix(".py"): int(floor)
@@ -36,7 +36,7 @@ def simulate_demo(folder: Path) -> None:
 
     truth = gyromodel.read_model(PACKAGE / "data" / "fiber_optic_truth.yaml")
     campaign = simulate(truth, read_plan(PACKAGE / "data" / "fiber_optic_plan.yaml"), seed=0)
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
     gyromodel.write_campaign(campaign, folder / "campaign.csv")
 
 
@@ -50,6 +50,18 @@ def test_every_python_block_of_the_readme_runs(tmp_path: Path):
     assert printed[1].startswith("named ['bias_temperature_rate'] ")
     assert f"# {printed[2]}\n" in README
     assert f"# {', '.join(printed[3:])}\n" in README
+
+
+def test_the_first_answer_is_what_the_demo_finds(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    simulate_demo(tmp_path)
+    block = next(b for b in re.findall(r"^```yaml\n(.*?)^```$", README, re.MULTILINE | re.DOTALL) if "noise: auto" in b)
+    (tmp_path / "simulation.yaml").write_text(block, encoding="utf-8")
+    with pytest.raises(SystemExit):
+        cli.main(["diagnose", str(tmp_path / "campaign.csv"), "--model", str(tmp_path / "simulation.yaml"),
+                  "-o", str(tmp_path / "results")])  # fmt: skip
+    said = " ".join(capsys.readouterr().out.split()).partition(str(tmp_path))[0].strip()
+    assert said.startswith("Your simulation lacks a temperature-rate bias")
+    assert said in " ".join(README.split())
 
 
 def test_the_ring_laser_table_is_what_the_demo_finds():

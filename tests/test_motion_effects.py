@@ -25,13 +25,9 @@ from tests.truth.motion_designs import EARTH, MOTION_DESIGNS, Sines, cube_attitu
 DEG_H = np.pi / 180 / 3600
 
 
-def lived(name: str, rng: np.random.Generator):
-    return MOTION_DESIGNS[name](rng)
-
-
 @pytest.mark.parametrize("name", MOTION_DESIGNS)
 def test_designs_are_campaigns_that_could_have_been(name: str, rng: np.random.Generator):
-    design = lived(name, rng)
+    design = MOTION_DESIGNS[name](rng)
     assert 850 <= len(design.index) <= 1050
     assert set(design.columns) == set(design.units)
     assert np.array_equal(design.true["time"], design.index * design.step)
@@ -51,7 +47,7 @@ def test_attitudes_turn_gravity_and_the_earth_alike(rng: np.random.Generator):
     # The angle between them is that of the latitude, in every attitude.
     assert np.sum(earth * force, axis=1) == pytest.approx(EARTH * np.sin(0.7))
     for name in ("tumble", "one_axis_tumble"):
-        design = lived(name, rng)
+        design = MOTION_DESIGNS[name](rng)
         assert len(np.unique(design.columns["position"])) == 36
         rates = [design.true[name] for name in ("rate", "rate_output", "rate_spin")]
         assert np.linalg.norm(rates, axis=0) == pytest.approx(EARTH, rel=1e-6)
@@ -60,10 +56,15 @@ def test_attitudes_turn_gravity_and_the_earth_alike(rng: np.random.Generator):
 
 
 def test_simulators_follow_their_closed_forms(rng: np.random.Generator):
-    a, b, c = (lived(n, rng) for n in ("tumble", "turntable", "dynamic_rates"))
-    force = {axis: a.true[f"acceleration_{axis}"] for axis in ("input", "output", "spin")}
-    for axis, values in force.items():
-        assert error(f"bias_acceleration_{axis}", a, 3.0, {}) == pytest.approx(3.0 * values)
+    a, b, c = (MOTION_DESIGNS[n](rng) for n in ("tumble", "turntable", "dynamic_rates"))
+    # Of a unit vector's three components: up, down or level along the axes of the cube, each as often as the others.
+    force = {axis: error(f"bias_acceleration_{axis}", a, 3.0, {}) / 3.0 for axis in ("input", "output", "spin")}
+    assert sum(f**2 for f in force.values()) == pytest.approx(1.0)
+    along = cube_attitudes()
+    upright = replace(a, true=a.true | {"turns": np.array(along)})
+    for axis in force:
+        values, counts = np.unique(error(f"bias_acceleration_{axis}", upright, 3.0, {}).round(9), return_counts=True)
+        assert (list(values), list(counts)) == ([-3.0, 0.0, 3.0], [4, 16, 4])
     sideways = np.array([[0.0, 0.5, 0.0], [0.5, 0.0, 0.0], [0.0, 0.0, 0.0]])
     squared = error("bias_acceleration_squared", a, 3.0, {"compliance": sideways})
     assert squared == pytest.approx(3.0 * force["input"] * force["output"], abs=1e-12)
@@ -90,7 +91,7 @@ def test_simulators_follow_their_closed_forms(rng: np.random.Generator):
 
 def test_simulated_delay_and_lag_have_their_frequency_response(rng: np.random.Generator):
     """One sine: a delay turns its phase by −ωδ, a lag multiplies by 1/(1 + iωτ)."""
-    design = lived("dynamic_rates", rng)
+    design = MOTION_DESIGNS["dynamic_rates"](rng)
     omega, phase = 2 * np.pi * 3.0, 0.4
     sine = Sines(np.ones(1), np.array([omega]), np.array([phase]))
     design = replace(design, motion={"rate": sine, "output": sine})
@@ -126,7 +127,7 @@ def campaign_of(design, output: np.ndarray, *without: str) -> Campaign:
 
 
 def test_the_bank_says_what_a_campaign_cannot_show(rng: np.random.Generator):
-    design = lived("tumble", rng)
+    design = MOTION_DESIGNS["tumble"](rng)
     noise = rng.standard_normal(len(design.index))
     bank = build_bank(read_signals(campaign_of(design, noise)))
     names = bank.names()
@@ -146,7 +147,7 @@ def test_the_bank_says_what_a_campaign_cannot_show(rng: np.random.Generator):
 
 
 def test_columns_by_x_y_z_keep_their_drivers(rng: np.random.Generator):
-    design = lived("tumble", rng)
+    design = MOTION_DESIGNS["tumble"](rng)
     axes = {"input": "x", "output": "y", "spin": "z"}
     turned = {
         f"{k.rpartition('_')[0]}_{axes[k.rpartition('_')[2]]}": k
@@ -166,11 +167,7 @@ def test_columns_by_x_y_z_keep_their_drivers(rng: np.random.Generator):
     assert "acceleration_z*acceleration_z" not in squared.products
 
 
-SUITABLE = {
-    "tumble": ("bias_acceleration_spin", "bias_acceleration_squared"),
-    "turntable": ("table_tilt", "bias_magnetic", "table_harmonic"),
-    "dynamic_rates": ("bias_vibration", "bias_anisoinertia", "misalignment", "output_axis_acceleration"),
-}
+SUITABLE = (("tumble", "bias_acceleration_squared"), ("turntable", "table_tilt"), ("dynamic_rates", "misalignment"))
 
 
 def told(design: str, effect: str, seed: int):
@@ -180,12 +177,11 @@ def told(design: str, effect: str, seed: int):
     return gyromodel.diagnose(campaign, model, hold_out=False), campaign
 
 
-@pytest.mark.parametrize("design", SUITABLE)
-def test_hidden_effects_of_motion_are_named(design: str, seed: int):
-    """One a design, another each time."""
-    effect = SUITABLE[design][seed % len(SUITABLE[design])]
-    found, _ = told(design, effect, seed)
-    assert (found.verdict, [c.effect for c in found.causes]) == ("named", [effect]), f"seed {seed}, {effect}"
+# The verdicts below are examples, of fixed seeds; the study counts how often they are right.
+@pytest.mark.parametrize(("design", "effect"), SUITABLE)
+def test_hidden_effects_of_motion_are_named(design: str, effect: str):
+    found, _ = told(design, effect, 1)
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", [effect])
 
 
 EXACT = {
@@ -195,10 +191,10 @@ EXACT = {
 
 
 @pytest.mark.parametrize("design", EXACT)
-def test_exact_confusions_are_told_of(design: str, seed: int):
+def test_exact_confusions_are_told_of(design: str):
     members, test = EXACT[design]
-    found, campaign = told(design, sorted(members)[seed % 3], seed)
-    assert found.verdict == "ambiguous", f"seed {seed}"
+    found, campaign = told(design, sorted(members)[1], 1)
+    assert found.verdict == "ambiguous"
     assert set(found.credible_set) == members
     assert found.next_test is not None
     assert test in found.next_test
@@ -216,12 +212,16 @@ def test_exact_confusions_are_told_of(design: str, seed: int):
         assert np.sum(rates * force, axis=0) == pytest.approx(np.sum(before * force, axis=0), abs=1e-4 * EARTH)
 
 
-def test_delay_and_lag_are_one_to_first_order_and_two_beyond(rng: np.random.Generator, seed: int):
-    small, _ = told("dynamic_rates", "time_delay", seed)
-    assert (small.verdict, set(small.credible_set)) == ("ambiguous", {"time_delay", "bandwidth"}), f"seed {seed}"
+def test_delay_and_lag_are_one_to_first_order_and_two_beyond():
+    built = study.build(study.Case(1, "dynamic_rates", "white", "time_delay", 3.0))
+    assert built.truth.amplitude > 0.2 * built.design.step
+    campaign, model = Campaign(built.columns, built.units, built.metadata), model_from_effects(built.truth.baseline)
+    small = gyromodel.diagnose(campaign, model, hold_out=False)
+    assert (small.verdict, set(small.credible_set)) == ("ambiguous", {"time_delay", "bandwidth"})
 
     # Two samples late at up to 4 Hz, the phase bends.
-    design = lived("dynamic_rates", rng)
+    rng = np.random.default_rng(1)
+    design = MOTION_DESIGNS["dynamic_rates"](rng)
     late = design.true["rate"] + error("time_delay", design, 0.02, {})
     noisy = campaign_of(design, late + np.deg2rad(0.2) * rng.standard_normal(len(late)))
     large = gyromodel.diagnose(noisy, model_from_effects(["scale_factor", "bias"]), hold_out=False)

@@ -21,6 +21,7 @@ from gyromodel.numerics.maximise import maximise
 from tests.truth import noise as truth
 
 RARE = 1e-5
+FEW = 1e-3  # the same where eight records must tell: with less, a coverage of one half would pass
 ROWS, STEP, N = 800, 0.5, 0.02
 
 
@@ -172,7 +173,7 @@ def test_white_noise_alone_is_seldom_anything_else(rng: np.random.Generator):
         other += any(t.verdict != "not identifiable" for t in rest)
         assert all(t.low == 0.0 for t in rest if t.verdict == "not identifiable")
     assert binom.sf(other - 1, 8, 0.03) > RARE
-    assert binom.cdf(covered, 8, 0.93) > RARE
+    assert binom.cdf(covered, 8, 0.93) > FEW
 
 
 def test_quantisation_alone_is_not_read_as_white_noise(fixed: np.random.Generator):
@@ -219,7 +220,7 @@ def test_limits_of_lines_and_of_unseen_markov_noise_hold(rng: np.random.Generato
         off = abs(first.amplitude - 0.02) / first.std, abs(first.frequency - 0.3111) / first.frequency_std
         hits += [off[0] < 1.96, off[1] < 1.96, bounds[-1] > q]
     for held in hits:
-        assert binom.cdf(held, 8, 0.93) > RARE
+        assert binom.cdf(held, 8, 0.93) > FEW
     assert np.median(bounds) < 3.0 * q
 
 

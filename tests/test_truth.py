@@ -6,30 +6,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from scipy.stats import binomtest, kstest, kurtosis, norm
+from scipy.stats import binom, binomtest, kstest, kurtosis, norm
 from scipy.stats import t as student_t
 
 from tests.truth import contest, levels, noise, study
-from tests.truth.campaigns import LOOP, RUNS, TESTABLE, UNCATALOGUED, A, B, C, hide
+from tests.truth.campaigns import HOMES, MOTION, RUNS, TESTABLE, UNCATALOGUED, A, B, C, hide
 from tests.truth.designs import DESIGNS, RAMP_CODES
 from tests.truth.effects import EFFECTS, UNKNOWN, coil_temperature_rate, draw_shape, error
 from tests.truth.mde import REGULAR, SCAN, amplitude, baseline, oracle, simpler, target
 from tests.truth.motion_designs import MOTION_DESIGNS
 
 RARE = 1e-5  # chance that a right simulator fails one statistical check
-
-
-@pytest.fixture
-def seed(record_property) -> int:
-    value = int(np.random.SeedSequence().generate_state(1)[0])
-    record_property("seed", value)
-    print(f"seed {value}")  # pytest shows it on failure
-    return value
-
-
-@pytest.fixture
-def rng(seed) -> np.random.Generator:
-    return np.random.default_rng(seed)
 
 
 def allan_variance(rate: np.ndarray, m: int) -> float:
@@ -312,16 +299,25 @@ def test_scan_for_a_step_has_about_the_power_the_mde_promises(rng):
 
 
 def test_oracle_names_a_strong_effect_and_least_squares_is_fooled_by_flicker(seed):
-    records = study.run_cases(study.effect_cases(17, seed, 3.0), engine=False)
-    assert sum(r.oracle_first == r.case.effect for r in records) >= 15
-    nulls = study.run_cases(study.null_cases(6, seed, ("flicker", "random_walk")), engine=False, controls=True)
-    assert sum(bool(r.controls["least_squares_f"].added) for r in nulls) >= 3
+    names = {e for d in HOMES for e in TESTABLE[d]}
+    records = study.run_cases(study.effect_cases(len(names), seed, 3.0), engine=False)
+    assert {r.case.effect for r in records} == names
+    # The prototype's oracle named 96 to 100 % of the isolable ones at this size, least squares 78 to 99 % of nulls.
+    right = sum(map(levels.oracle_right, records))
+    assert binom.cdf(right, len(records), 0.9) > RARE
+    cases = study.null_cases(12, seed, ("flicker", "random_walk"), (A, B, C))
+    nulls = study.run_cases(cases, engine=False, controls=True)
+    assert binom.cdf(sum(bool(r.controls["least_squares_f"].added) for r in nulls), 12, 0.75) > RARE
 
 
 def test_cases_reproduce_and_cover_every_design_and_noise(seed):
-    cases = study.effect_cases(17 * 9, seed, 3.0)
-    assert {(c.design, c.noise) for c in cases} == {(d, n) for d in (A, B, C, RUNS, LOOP) for n in noise.FAMILY[:3]}
-    assert {c.effect for c in cases} == {e for d in (A, B, C, RUNS, LOOP) for e in TESTABLE[d]}
+    names = {e for d in HOMES for e in TESTABLE[d]}
+    cases = study.effect_cases(len(names) * 9, seed, 3.0)
+    assert {(c.design, c.noise) for c in cases} == {(d, n) for d in HOMES for n in noise.FAMILY[:3]}
+    assert {c.effect for c in cases} == names
+    nulls = study.null_cases(60, seed, noise.OUTSIDE)
+    assert {c.design for c in nulls} == {*HOMES, *MOTION}
+    assert {c.noise for c in nulls} == {*noise.OUTSIDE}
     assert len({c.seed for c in cases}) == len(cases)
     one, two = study.build(cases[0]), study.build(cases[0])
     assert all(np.array_equal(one.columns[k], two.columns[k]) for k in one.columns)
