@@ -305,9 +305,10 @@ def test_oracle_names_a_strong_effect_and_least_squares_is_fooled_by_flicker(see
     # The prototype's oracle named 96 to 100 % of the isolable ones at this size, least squares 78 to 99 % of nulls.
     right = sum(map(levels.oracle_right, records))
     assert binom.cdf(right, len(records), 0.9) > RARE
-    cases = study.null_cases(12, seed, ("flicker", "random_walk"), (A, B, C))
+    cases = study.null_cases(6, seed, ("flicker", "random_walk"), (A, B, C))
     nulls = study.run_cases(cases, engine=False, controls=True)
-    assert binom.cdf(sum(bool(r.controls["least_squares_f"].added) for r in nulls), 12, 0.75) > RARE
+    fooled = sum(bool(r.controls["least_squares_f"].added) for r in nulls)
+    assert levels.Level("1", "", "", 0.75, True, fooled, len(nulls)).plausible
 
 
 def test_cases_reproduce_and_cover_every_design_and_noise(seed):
