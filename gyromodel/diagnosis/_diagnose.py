@@ -16,13 +16,14 @@ from gyromodel.diagnosis._calibrate import null_scores
 from gyromodel.diagnosis._evidence import SAFE_THRESHOLD
 from gyromodel.diagnosis._gain import ladder_error, nested_gain, no_gain, not_measured
 from gyromodel.diagnosis._isolation import settling_test
+from gyromodel.diagnosis._noise_causes import as_cause, quantisation, telegraph
 from gyromodel.diagnosis._ranking import Ranking, cells_of_weight, is_driver, is_noise, noise_kinds
-from gyromodel.diagnosis._result import Candidate, Diagnosis, Gain, Round
+from gyromodel.diagnosis._result import Candidate, Cause, Diagnosis, Gain, ParameterValue, Round
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._search import Found, NoisePath, Progress, Selection, search, standing
+from gyromodel.diagnosis._search import SLOW_IN_TIME, Found, NoisePath, Progress, Selection, search, standing
 from gyromodel.diagnosis._shapes import driver_shape, minimum_detectable, not_testable
 from gyromodel.diagnosis._variance import growing_noise, noise_level, steps_of_output, tails, with_variance
-from gyromodel.diagnosis._verdict import judge
+from gyromodel.diagnosis._verdict import judge, with_noise
 from gyromodel.estimate import Estimate, EstimateError, check_covariates, fit_record, with_noise_intervals
 from gyromodel.model import GyroModel, record_span
 from gyromodel.noise import NoiseGrid, NoiseRatios, noise_grid
@@ -136,18 +137,29 @@ def diagnose(
         session.threshold = max(float(np.quantile(nulls, 0.99)), 0.0)
     selection = session.run(baseline, say)
     grows = growing_noise(record, selection.estimate)
+    unit = _rate_unit(campaigns[0])
+    beyond: list[Cause] = []
     if grows is not None:
-        findings.append(f"The noise level follows {grows[0]}; samples are weighted accordingly.")
-        record = with_variance(record, grows[1])
+        times = max(grows.ratio, 1.0 / grows.ratio)
+        findings.append(
+            f"The noise level follows {grows.driver}, {times:.3g} times as large at one end as at the other; samples "
+            "are weighted accordingly."
+        )
+        ratio = ParameterValue("ratio", grows.ratio, grows.ratio_std, "1")
+        beyond.append(as_cause("noise_heteroscedastic", grows.evidence, ratio))
+        record = with_variance(record, grows.white)
         baseline = fit_record(record, model)
         session = _Session(Scanner(record, bank, grid, stated=baseline.noise_given), session.threshold)
         selection = session.run(baseline, say)
+    hops = telegraph(baseline, selection.estimate, unit) if _like_hops(selection) else None
+    if hops is not None:
+        beyond.append(hops)
+        selection = Selection(baseline, (), (), selection.last, (baseline,), None)
     if hold_out:
         say("judging each step on blocks left out", 0.62)
         selection = session.pruned(selection)
     findings += [line for line in (tails(selection.estimate), noise_level(selection.estimate)) if line]
     say("judging", 0.65)
-    unit = _rate_unit(campaigns[0])
     scale = factor("rad/s", unit)
     ordinary = tuple(hold_out and session.ladder(e)[2] for e in (baseline, selection.estimate))
     extended = _finished(selection.estimate, ordinary[1])
@@ -158,6 +170,16 @@ def diagnose(
             "do."
         )
     judgement = judge(record, session.scanner, baseline, selection, extended, len(bank.names()), nulls)
+    stepped = quantisation(selection.estimate, session.threshold)
+    if stepped is not None:
+        beyond.append(stepped)
+        size = stepped.parameters[0].value
+        findings.append(
+            f"The noise from sample to sample is in part that of quantisation, {size:.3g} arcsec (white noise of the "
+            "angle); fits take it as white noise of the rate."
+        )
+    # Where the simulation leaves its noise to be estimated, its kinds are no discrepancy, but for what no fit holds.
+    judgement = with_noise(judgement, beyond if baseline.noise_given else [c for c in beyond if c is hops])
     next_test = judgement.next_test
     if judgement.verdict == "ambiguous":
         searched = [c for c, _ in shortened]
@@ -226,6 +248,13 @@ def _rate_unit(campaign: Campaign) -> str:
         if name in campaign.units and convertible(campaign.units[name], "rad/s"):
             return campaign.units[name]
     return "deg/s"
+
+
+def _like_hops(selection: Selection) -> bool:
+    """Whether all that was found is what hops of the bias could be taken for."""
+    in_time = all(f.frees_noise or f.name in (*SLOW_IN_TIME, "bias_periodic") for f in selection.found)
+    slow = any(float(r) > 0 for r in selection.estimate.ratios)
+    return in_time and selection.driver in (None, "smooth(time)") and (slow or bool(selection.found))
 
 
 def _p_value(selection: Selection, nulls: np.ndarray) -> float:

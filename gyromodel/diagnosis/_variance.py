@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 import numpy as np
 from scipy import stats
@@ -36,8 +38,21 @@ def variance_drivers(record: Record) -> dict[str, np.ndarray]:
     return found
 
 
-def growing_noise(record: Record, estimate: Estimate) -> tuple[str, np.ndarray] | None:
-    """The driver that the noise level follows most, with the variance it gives each sample; None where none does."""
+class Growth(NamedTuple):
+    """What the noise level follows, the variance it gives each sample, σ at its largest over σ at its least, evidence.
+
+    `ratio_std` is the standard error of that ratio.
+    """
+
+    driver: str
+    white: np.ndarray
+    ratio: float
+    ratio_std: float
+    evidence: float
+
+
+def growing_noise(record: Record, estimate: Estimate) -> Growth | None:
+    """The driver that the noise level follows most; None where it follows none."""
     use = np.isfinite(estimate.whitened)
     # Large residuals are shortened, so that a few gross errors do not pass for a trend.
     e = np.minimum(estimate.whitened[use] ** 2, 9.0)
@@ -50,9 +65,13 @@ def growing_noise(record: Record, estimate: Estimate) -> tuple[str, np.ndarray] 
             best = (statistic, label, z)
     if best is None or stats.chi2.sf(best[0], 1) * len(drivers) > SIGNIFICANT:
         return None
-    slope = _log_slope(best[2][: record.rows][use], estimate.whitened[use] ** 2)
-    white = np.exp(slope * (np.clip(best[2], 0.0, 1.0) - best[2][: record.rows][use].mean()))
-    return best[1], np.asarray(record.sampling.white) * white
+    x = best[2][: record.rows][use]
+    slope = _log_slope(x, estimate.whitened[use] ** 2)
+    white = np.exp(slope * (np.clip(best[2], 0.0, 1.0) - x.mean()))
+    ratio = float(np.exp(0.5 * slope))
+    std = ratio * float(np.sqrt(0.5 / np.sum((x - x.mean()) ** 2)))
+    evidence = 0.5 * (best[0] - np.log(len(e))) - np.log(len(drivers))
+    return Growth(best[1], np.asarray(record.sampling.white) * white, ratio, std, float(evidence))
 
 
 def _log_slope(x: np.ndarray, square: np.ndarray) -> float:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from math import comb
 
 import numpy as np
@@ -167,6 +168,15 @@ def judge(
     firm = tuple(c for c in named if c.effect not in sets[0])
     test = _next_test(list(sets[0]), record, causes[0])
     return Judgement("ambiguous", (*doubtful, *firm), sets[0], None, test, unexplained, tuple(findings))
+
+
+def with_noise(judgement: Judgement, beyond: Sequence[Cause]) -> Judgement:
+    """The judgement with kinds of noise that the simulation lacks beside what else it lacks."""
+    if not beyond:
+        return judgement
+    if judgement.verdict == "adequate":
+        judgement = replace(judgement, verdict="named", credible_set={beyond[0].effect: 1.0})
+    return replace(judgement, causes=(*judgement.causes, *beyond))
 
 
 def _close_rival(step: Found, members: dict[str, float]) -> str | None:

@@ -53,6 +53,9 @@ PHRASES = {
     "noise_flicker": "flicker noise (bias instability)",
     "noise_random_walk": "a rate random walk",
     "noise_markov": "Markov noise",
+    "noise_quantisation": "quantisation noise (white noise of the angle)",
+    "noise_telegraph": "hops of the bias between two levels (telegraph noise)",
+    "noise_heteroscedastic": "a noise level that varies",
     "noise_markov_time": "time constant of the Markov noise",
 }
 

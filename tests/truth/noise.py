@@ -63,6 +63,23 @@ def markov(n: int, step: float, q: float, Tc: float, rng: np.random.Generator) -
     return lfilter([1.0], [1.0, -decay], drive, zi=[decay * start])[0]
 
 
+def telegraph(n: int, step: float, size: float, time_low: float, time_high: float, rng: np.random.Generator) -> Array:
+    """Hops between 0 and `size`, each level held for an exponential time of its mean; begins on either."""
+    held, level, ends = [], bool(rng.random() < time_high / (time_low + time_high)), 0.0
+    while ends < n * step:
+        ends += rng.exponential(time_high if level else time_low)
+        held.append((ends, level))
+        level = not level
+    epochs, levels = (np.array(x) for x in zip(*held, strict=True))
+    return size * levels[np.searchsorted(epochs, step * np.arange(n))]
+
+
+def quantised(rate: Array, step: float, lsb: float) -> Array:
+    """Rate from an angle that is counted in whole steps of `lsb`."""
+    angle = np.concatenate([[0.0], np.cumsum(rate * step)])
+    return np.diff(np.round(angle / lsb) * lsb) / step
+
+
 @dataclass(frozen=True)
 class Noise:
     """One noise law: white plus coloured terms; SI units (rad/s).

@@ -1,0 +1,165 @@
+"""Noise of kinds that a fit cannot hold: quantisation, hops between two levels, a level that varies."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.fft import dst
+from scipy.optimize import minimize
+
+from gyromodel.diagnosis._evidence import log_sum
+from gyromodel.diagnosis._result import Cause, ParameterValue
+from gyromodel.estimate import Estimate, filter_of
+from gyromodel.units import factor
+
+# Even stretches shorter than this show no correlation from sample to sample.
+STRETCH = 16
+# Quantisation variances over white ones that are tried.
+SHARES = np.geomspace(1e-3, 1e3, 61)
+# A record with fewer hops than this has steps, each with an epoch of its own; fewer rows show no hops.
+FEWEST_HOPS, FEWEST_ROWS = 4, 100
+# Lead (nats) over coloured noise and steps from which hops are told.
+HOPS_LEAD = 10.0
+# Each level is held for four samples or more, and for this part of the record: heavy tails are no second level.
+LEAST_HELD = 0.05
+# Middle and half distance of the levels (ln), scatter about them (ln), chances of a hop a sample (logit) up and down.
+BOUNDS = ((-4.0, 4.0), (-6.0, 2.0), (-6.0, 1.0), (-12.0, -1.1), (-12.0, -1.1))
+
+
+def as_cause(name: str, evidence: float, *sizes: ParameterValue) -> Cause:
+    """Noise that the model lacks."""
+    p = float(np.exp(-max(evidence, 0.0)))
+    return Cause(name, sizes, evidence, p, p, 1.0)
+
+
+def quantisation(estimate: Estimate, threshold: float) -> Cause | None:
+    """Quantisation noise (white noise of the angle) in what a fit leaves, by its falling correlation.
+
+    Its covariance over an even stretch is tridiagonal, and the sine transform diagonalises it.
+    """
+    rows, record = estimate.record.rows, estimate.record
+    known = np.isfinite(estimate.whitened)
+    opens = np.asarray(record.sampling.restart)[:rows] | (
+        np.asarray(record.sampling.interval)[:rows] > 1.5 * record.interval
+    )
+    group = np.cumsum(opens | ~known)
+    stretches = [
+        estimate.whitened[known & (group == g)]
+        for g in np.unique(group[known])
+        if np.sum(known & (group == g)) >= STRETCH
+    ]
+    if not stretches:
+        return None
+    power = np.concatenate([np.square(np.asarray(dst(e, type=1, norm="ortho"))) for e in stretches])
+    spectrum = np.concatenate([2.0 - 2.0 * np.cos(np.pi * np.arange(1, len(e) + 1) / (len(e) + 1)) for e in stretches])
+    variance = 1.0 + SHARES[:, None] * spectrum
+    white = (power / variance).mean(1)
+    gain = -0.5 * np.log(variance).sum(1) - 0.5 * len(power) * np.log(white / power.mean())
+    evidence = log_sum(gain) - np.log(len(SHARES))
+    if evidence < threshold:
+        return None
+    weight = np.exp(gain - log_sum(gain))
+    unit = record.interval * np.sqrt(estimate.white_variance) / abs(float(estimate.model.gain()))
+    sizes = unit * np.sqrt(SHARES * white)
+    value = float(weight @ sizes)
+    std = float(np.sqrt(weight @ (sizes - value) ** 2 + (value**2) / (2.0 * len(power))))
+    scale = factor("rad", "arcsec")
+    return as_cause(
+        "noise_quantisation",
+        float(evidence),
+        ParameterValue("noise_quantisation", value * scale, std * scale, "arcsec"),
+    )
+
+
+def telegraph(baseline: Estimate, extended: Estimate, unit: str) -> Cause | None:
+    """Hops to and fro between two levels in what the baseline leaves, where no coloured noise or steps explain it."""
+    record = baseline.record
+    residual, here = baseline.residual, np.isfinite(baseline.residual)
+    count = int(here.sum())
+    if count < FEWEST_ROWS:
+        return None
+    y = (residual[here] - residual[here].mean()) / residual[here].std()
+    restart = np.asarray(record.sampling.restart)[: record.rows][here]
+
+    def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slope = _two_levels(jnp.asarray(x), y, restart)
+        return -float(value), -np.asarray(slope)
+
+    best = min((minimize(cost, x, jac=True, method="L-BFGS-B", bounds=BOUNDS) for x in _starts(y)), key=lambda r: r.fun)
+    upper = np.asarray(_levels(jnp.asarray(best.x), y, restart)) > 0.5
+    hops = int(np.sum(np.diff(upper) != 0))
+    # Both in nats of the same samples; every free number of each costs half of ln n.
+    other = _normal(extended, residual[here].std())
+    extra = len(extended.model.slots()) - len(baseline.model.slots()) + sum(float(r) > 0 for r in extended.ratios)
+    lead = -best.fun - other - 0.5 * (len(best.x) - 2 - extra) * np.log(count)
+    if hops < FEWEST_HOPS or lead < HOPS_LEAD or not LEAST_HELD < upper.mean() < 1.0 - LEAST_HELD:
+        return None
+    _, half, sigma, up, down = best.x
+    size = 2.0 * np.exp(half) * residual[here].std() / abs(float(baseline.model.gain()))
+    std = 2.0 * np.exp(sigma) * residual[here].std() / abs(float(baseline.model.gain())) / np.sqrt(count / 4.0)
+    dwell = [record.interval * (1.0 + np.exp(-rate)) for rate in (up, down)]
+    scale = factor("rad/s", unit)
+    return as_cause(
+        "noise_telegraph",
+        float(lead),
+        ParameterValue("size", size * scale, std * scale, unit),
+        *(
+            ParameterValue(name, float(t), float(t) / np.sqrt(max(hops / 2.0, 1.0)), "s")
+            for name, t in zip(("time_low", "time_high"), dwell, strict=True)
+        ),
+    )
+
+
+def _starts(y: np.ndarray) -> list[np.ndarray]:
+    """Levels at the means of the upper and lower half of samples, or of short means of them."""
+    starts = []
+    for m in (1, 8):
+        smooth = np.convolve(y, np.full(m, 1.0 / m), mode="same")
+        low, high = smooth[smooth < np.median(smooth)].mean(), smooth[smooth >= np.median(smooth)].mean()
+        half = max((high - low) / 2.0, 0.05)
+        starts.append(np.array([(low + high) / 2.0, np.log(half), np.log(max(1.0 - half**2, 0.05)) / 2.0, -4.0, -4.0]))
+    return starts
+
+
+def _emissions(x, y):
+    """Log likelihood of each sample in each level, and chances of a hop up and down."""
+    levels = x[0] + jnp.array([-1.0, 1.0]) * jnp.exp(x[1])
+    scatter = jnp.exp(x[2])
+    each = -0.5 * ((y[:, None] - levels) / scatter) ** 2 - jnp.log(scatter) - 0.5 * jnp.log(2.0 * jnp.pi)
+    return each, jax.nn.sigmoid(x[3]), jax.nn.sigmoid(x[4])
+
+
+def _forward(x, y, restart):
+    each, up, down = _emissions(x, y)
+    hop = jnp.array([[1.0 - up, up], [down, 1.0 - down]])
+    still = jnp.array([down, up]) / (up + down)
+
+    def step(share, sample):
+        log_likelihood, opens = sample
+        top = log_likelihood.max()
+        joint = jnp.where(opens, still, share @ hop) * jnp.exp(log_likelihood - top)
+        total = joint.sum()
+        return joint / total, (jnp.log(total) + top, joint[1] / total)
+
+    return jax.lax.scan(step, still, (each, restart))[1]
+
+
+@jax.jit
+def _two_levels(x, y, restart):
+    """Log likelihood of samples about two levels, and its derivative."""
+    return jax.value_and_grad(lambda x: _forward(x, y, restart)[0].sum())(x)
+
+
+@jax.jit
+def _levels(x, y, restart):
+    """Chance that each sample is on the upper level, seen from those before it."""
+    return _forward(x, y, restart)[1]
+
+
+def _normal(estimate: Estimate, scale: float) -> float:
+    """Log likelihood of the residual of a fit in its noise, in units of `scale`."""
+    e = estimate.whitened[np.isfinite(estimate.whitened)]
+    spread = np.log(np.sqrt(estimate.white_variance) / scale)
+    determinant = 0.5 * float(filter_of(estimate.record, estimate.ratios).log_determinant)
+    return float(-0.5 * np.sum(e**2) - len(e) * (spread + 0.5 * np.log(2.0 * np.pi)) - determinant)

@@ -1,0 +1,92 @@
+"""Noise of kinds that a fit cannot hold, each against a simulator of its own (tests/truth/noise.py)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+import gyromodel as gm
+from gyromodel.diagnosis._noise_causes import quantisation, telegraph
+from gyromodel.estimate import Estimate
+from tests.truth import noise as truth
+from tests.truth.designs import Design
+
+ROWS, STEP = 600, 20.0
+WHITE = np.deg2rad(1 / 3600) * np.sqrt(STEP)  # N of 1 deg/h in a sample
+RARE = 1e-4
+
+
+def log(output: np.ndarray) -> gm.Campaign:
+    """A log at rest, in rad/s."""
+    columns = {"time": np.arange(len(output)) * STEP, "output": output}
+    return gm.Campaign(columns, {"time": "s", "output": "rad/s"}, {"kind": "rate"})
+
+
+def fitted(output: np.ndarray) -> Estimate:
+    return gm.fit(log(output), gm.model_from_effects(["bias"]))
+
+
+def stated() -> gm.GyroModel:
+    """A bias in white noise that is stated."""
+    model = gm.model_from_effects(["bias"])
+    return gm.GyroModel(model.effects, {"noise_white": WHITE}, model.fixed, model.gyro)
+
+
+def white(rng: np.random.Generator) -> np.ndarray:
+    return truth.white(ROWS, STEP, WHITE, rng)
+
+
+def test_quantisation_of_the_angle_has_its_size(rng: np.random.Generator):
+    """An angle counted in whole steps: its rounding errors have a variance of a twelfth of a step squared."""
+    step = 2.5 * WHITE * np.sqrt(STEP)
+    found = [quantisation(fitted(truth.quantised(white(rng), STEP, step)), 4.0) for _ in range(12)]
+    sizes = [np.deg2rad(c.parameters[0].value / 3600) for c in found if c is not None]
+    errors = [np.deg2rad(c.parameters[0].std / 3600) for c in found if c is not None]
+    assert binom.cdf(len(sizes), 12, 0.97) > RARE
+    inside = sum(abs(size - step / np.sqrt(12.0)) < 1.96 * e for size, e in zip(sizes, errors, strict=True))
+    assert binom.cdf(inside, len(sizes), 0.93) > RARE
+
+
+def test_hops_between_two_levels_have_their_size_and_times(rng: np.random.Generator):
+    size, times = 3.0 * WHITE / np.sqrt(STEP), (1600.0, 1000.0)
+    hits, found = [], 0
+    for _ in range(8):
+        estimate = fitted(white(rng) + truth.telegraph(ROWS, STEP, size, *times, rng))
+        cause = telegraph(estimate, estimate, "rad/s")
+        found += cause is not None
+        values = cause.parameters if cause is not None else ()
+        hits += [abs(p.value - true) < 2.5 * p.std for p, true in zip(values, (size, *times), strict=False)]
+    assert binom.cdf(found, 8, 0.95) > RARE
+    assert binom.cdf(sum(hits), len(hits), 0.93) > RARE
+
+
+@pytest.mark.parametrize("kind", [*truth.FAMILY, "markov", "student_t3"])
+def test_other_noise_is_neither(kind: str, rng: np.random.Generator):
+    index = np.arange(ROWS)
+    laid = Design("static", STEP, index, {}, {}, {}, {}, (index, index))
+    false = 0
+    for _ in range(5):
+        estimate = fitted(truth.draw(kind, laid, rng).sample(laid, rng))
+        false += quantisation(estimate, 4.0) is not None
+        false += telegraph(estimate, estimate, "rad/s") is not None
+    assert binom.sf(false - 1, 10, 0.01) > RARE
+
+
+def test_kinds_of_noise_that_are_not_stated_are_causes():
+    """Examples of a fixed seed: stated as white, and to be estimated, where only hops are no noise that a fit holds."""
+    rng = np.random.default_rng(4)
+    hops = white(rng) + truth.telegraph(ROWS, STEP, 4.0 * WHITE / np.sqrt(STEP), 1600.0, 1000.0, rng)
+    rounded = truth.quantised(white(rng), STEP, 4.0 * WHITE * np.sqrt(STEP))
+    growing = white(rng) * np.linspace(1.0, 3.0, ROWS)
+    for output, name, sentence in (
+        (hops, "noise_telegraph", ""),
+        (rounded, "noise_quantisation", "that of quantisation"),
+        (growing, "noise_heteroscedastic", "follows time"),
+    ):
+        found = gm.diagnose(log(output), stated(), hold_out=False)
+        assert (found.verdict, [c.effect for c in found.causes]) == ("named", [name])
+        assert set(found.credible_set) == {name}
+        free = gm.diagnose(log(output), gm.model_from_effects(["bias"]), hold_out=False)
+        assert [c.effect for c in free.causes] == ([name] if name == "noise_telegraph" else [])
+        assert any(sentence in line for line in (*free.findings, ""))
