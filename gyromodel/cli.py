@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
-import math
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from io import TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -16,6 +13,16 @@ import typer
 
 import gyromodel
 from gyromodel._atomic import write_text
+from gyromodel._console import (
+    json_text,
+    prepare_folder,
+    print_paths,
+    print_table,
+    progress_bar,
+    read_campaigns,
+    refusal,
+    refuse_overwriting,
+)
 
 if TYPE_CHECKING:
     from gyromodel.campaign import Campaign
@@ -23,14 +30,6 @@ if TYPE_CHECKING:
 
 DATA = Path(__file__).parent / "data"
 REPORTS = ("report.html", "diagnosis.json", "model.yaml")
-# Errors that mean "the data or the model cannot answer", by the module that defines them.
-_REFUSALS = {
-    "gyromodel._checks": "CampaignError",
-    "gyromodel.units": "UnitError",
-    "gyromodel.model": "ModelError",
-    "gyromodel.estimate": "EstimateError",
-}
-
 # Help without rich: it loads in half the time.
 app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -57,18 +56,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except Exception as error:
         if os.environ.get("GYROMODEL_DEBUG") == "1":
             raise
-        print(f"gyromodel: {_sentence(error)}", file=sys.stderr)
+        print(f"gyromodel: {refusal(error)}", file=sys.stderr)
         sys.exit(1)
-
-
-def _sentence(error: Exception) -> str:
-    refusals = tuple(getattr(sys.modules[m], name) for m, name in _REFUSALS.items() if m in sys.modules)
-    if isinstance(error, refusals):
-        return str(error)
-    if isinstance(error, OSError) and error.strerror:
-        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    found = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-    return f"internal error ({found}); please report it with the output under GYROMODEL_DEBUG=1"
 
 
 def _print_version(wanted: bool) -> bool:
@@ -113,43 +102,45 @@ def demo(as_json: AsJson = False) -> None:
     }
     found = {}
     for folder, title in titles.items():
-        diagnosis, verdict = _diagnose(_read([folder / "campaign.csv"], None), folder / "simulation.yaml", folder)
+        diagnosis, verdict = _diagnose(
+            read_campaigns([folder / "campaign.csv"], None), folder / "simulation.yaml", folder
+        )
         found["ring_laser" if folder is table else "fiber_optic"] = diagnosis.to_dict() | {"model": "model.yaml"}
         if not as_json:
             print(f"{title}\n{verdict}")
-            _print_paths(folder, *REPORTS)
+            print_paths(folder, *REPORTS)
             print()
     if as_json:
-        print(_json(found), end="")
+        print(json_text(found), end="")
 
 
 @app.command()
 def fit(campaigns: Campaigns, model: ModelFile, output: Folder, axis: Axis = None, as_json: AsJson = False) -> None:
     """Fit a model to the campaigns of one unit, jointly."""
-    _prepare(output, model)
+    prepare_folder(output, model)
     from gyromodel.attitude import with_reference_rates
     from gyromodel.estimate import fit as fit_model
     from gyromodel.model_files import read_model, write_model
 
-    start, measured = read_model(model), _read(campaigns, axis)
+    start, measured = read_model(model), read_campaigns(campaigns, axis)
     for line in [line for campaign in measured if (line := with_reference_rates(campaign)[1])]:
         print(f"gyromodel: {line}", file=sys.stderr)
-    with _progress() as progress:
+    with progress_bar() as progress:
         estimate = fit_model(measured, start, progress=progress)
     result = estimate.to_dict()
     write_model(estimate, output / "model.yaml")
-    write_text(output / "fit.json", _json(result))
+    write_text(output / "fit.json", json_text(result))
     if as_json:
-        print(_json(result), end="")
+        print(json_text(result), end="")
         return
     from gyromodel.report import with_uncertainty
 
     rows = [(row.effect, row.name, with_uncertainty(row.value, row.std, row.unit)) for row in estimate.table()]
-    _print_table(("effect", "parameter", "value ± standard uncertainty"), rows)
+    print_table(("effect", "parameter", "value ± standard uncertainty"), rows)
     noise = [(name, *(f"{n[k]:.3g}" for k in ("value", "lo", "hi")), n["unit"]) for name, n in result["noise"].items()]
     print()
-    _print_table(("noise", "value", "95 % from", "to", "unit"), noise)
-    _print_paths(output, "model.yaml", "fit.json")
+    print_table(("noise", "value", "95 % from", "to", "unit"), noise)
+    print_paths(output, "model.yaml", "fit.json")
 
 
 @app.command()
@@ -171,17 +162,17 @@ def diagnose(
     """
     if 0 < calibrate < 200:
         raise typer.BadParameter("200 campaigns or more show a 99 % point; 0 takes the safe threshold", param_hint="N")
-    measured = _read(campaigns, axis)
+    measured = read_campaigns(campaigns, axis)
     if len(measured[0].outputs) > 1:
         result, verdict, written = _diagnose_axes(measured, model, output, calibrate, seed)
     else:
         diagnosis, verdict = _diagnose(measured, model, output, calibrate=calibrate, seed=seed)
         result, written = diagnosis.to_dict() | {"model": "model.yaml"}, REPORTS
     if as_json:
-        print(_json(result), end="")
+        print(json_text(result), end="")
     else:
         print(verdict)
-        _print_paths(output, *written)
+        print_paths(output, *written)
 
 
 @app.command()
@@ -198,7 +189,7 @@ def simulate(
     pattern_file = like or plan
     if pattern_file is None or (like and plan):
         raise typer.BadParameter("give either --like CAMPAIGN or --plan PLAN.yaml", param_hint="--like")
-    _refuse_overwriting(output, [model, pattern_file])
+    refuse_overwriting(output, [model, pattern_file])
     from gyromodel.files import read_campaign, write_campaign
     from gyromodel.model import simulate as simulate_campaign
     from gyromodel.model_files import read_model
@@ -210,7 +201,7 @@ def simulate(
     output.parent.mkdir(parents=True, exist_ok=True)
     write_campaign(simulated, output)
     result = {"campaign": str(output), "rows": len(simulated), "seed": seed, "data_hash": simulated.digest()}
-    print(_json(result) if as_json else f"{len(simulated)} samples in {output}\n", end="")
+    print(json_text(result) if as_json else f"{len(simulated)} samples in {output}\n", end="")
 
 
 @app.command()
@@ -227,10 +218,10 @@ def plan(
 
     found = isolability(read_plan(design), read_model(model))
     if as_json:
-        print(_json(found.to_dict()), end="")
+        print(json_text(found.to_dict()), end="")
         return
     header = ("effect", "found from (80 %)", "hardest to tell from", "told apart from (95 %)", "unit")
-    _print_table(header, isolability_rows(found))
+    print_table(header, isolability_rows(found))
     for name, reason in found.not_testable.items():
         print(f"Not testable: {name} ({reason}).")
     print("\nFurther tests, the most helpful first:")
@@ -251,7 +242,7 @@ def compensate(
 
     On a campaign with a reference rate, a calibration that makes its error larger is refused.
     """
-    _refuse_overwriting(output, [model, campaign])
+    refuse_overwriting(output, [model, campaign])
     from gyromodel._checks import CampaignError
     from gyromodel.compensation import compensate as compensate_campaign
     from gyromodel.compensation import reference_error
@@ -259,7 +250,7 @@ def compensate(
     from gyromodel.model_files import read_calibration
 
     calibration = read_calibration(model)
-    compensated = compensate_campaign(_read([campaign], axis)[0], calibration)
+    compensated = compensate_campaign(read_campaigns([campaign], axis)[0], calibration)
     error, held = reference_error(compensated), ""
     if error:
         held = f"rms error against its reference rate is {error.compensated:.4g} deg/s, and {error.as_measured:.4g} as"
@@ -272,7 +263,7 @@ def compensate(
         print(f"gyromodel: {note}", file=sys.stderr)
     result = {"campaign": str(output), "rows": len(compensated), "note": note, "data_hash": compensated.digest()}
     if as_json:
-        print(_json(result | {"reference_error": error and error._asdict()}), end="")
+        print(json_text(result | {"reference_error": error and error._asdict()}), end="")
         return
     print(f"{len(compensated)} samples in {output}" + (f"; the {held} measured" if held else ""))
 
@@ -287,7 +278,7 @@ def export(
 ) -> None:
     """Write a calibration for firmware and spreadsheets."""
     if output:
-        _refuse_overwriting(output, [model])
+        refuse_overwriting(output, [model])
     from gyromodel.export import export_calibration
     from gyromodel.model_files import read_calibration
 
@@ -310,18 +301,18 @@ def allan(
     from gyromodel.noise_analysis import analyse_noise
     from gyromodel.report import deviation_figure, noise_rows
 
-    [measured] = _read([campaign], axis)
-    with _progress() as progress:
+    [measured] = read_campaigns([campaign], axis)
+    with progress_bar() as progress:
         analysis = analyse_noise(measured, progress=progress)
     result = analysis.to_dict()
-    write_text(output / "allan.json", _json(result))
+    write_text(output / "allan.json", json_text(result))
     write_text(output / "allan.svg", deviation_figure(analysis))
     if as_json:
-        print(_json(result), end="")
+        print(json_text(result), end="")
         return
-    _print_table(("noise", "", "value", "95 % from", "to", "unit", "verdict"), noise_rows(analysis))
+    print_table(("noise", "", "value", "95 % from", "to", "unit", "verdict"), noise_rows(analysis))
     print("".join(f"\n{remark}\n" for remark in analysis.remarks), end="")
-    _print_paths(output, "allan.json", "allan.svg")
+    print_paths(output, "allan.json", "allan.svg")
 
 
 @app.command()
@@ -343,17 +334,17 @@ def effects(
         raise typer.BadParameter(f"no effect is called {effect}{hint}", param_hint="ID")
     if as_json:
         entries = asdict(catalogue[effect]) if effect else [asdict(entry) for entry in catalogue.values()]
-        print(_json(entries), end="")
+        print(json_text(entries), end="")
     elif effect is None:
         rows = [(e.id, e.site, ", ".join(e.needs) or "–", e.equation) for e in catalogue.values()]
-        _print_table(("effect", "acts on", "needs", "equation"), rows)
+        print_table(("effect", "acts on", "needs", "equation"), rows)
     else:
         entry = catalogue[effect]
         needs = ", ".join(entry.needs) or "no column"
         print("\n".join(filter(None, [entry.id, entry.equation, entry.details])))
         print(f"\nacts on  {entry.site}\nneeds    {needs}\ncause    {entry.cause}\ntest     {entry.test}\n")
         rows = [(p.name, f"{p.typical:g}", p.unit, p.meaning) for p in entry.parameters]
-        _print_table(("parameter", "typical", "unit", "meaning"), rows)
+        print_table(("parameter", "typical", "unit", "meaning"), rows)
 
 
 def _diagnose_axes(
@@ -387,7 +378,7 @@ def _diagnose_axes(
         print(f"gyromodel: axis {axis} was not diagnosed: {reason}", file=sys.stderr)
     lie = triad(measured, extended)
     result = {"axes": axes, "not_diagnosed": not_diagnosed, "triad": lie and lie.to_dict()}
-    write_text(output / "axes.json", _json(result))
+    write_text(output / "axes.json", json_text(result))
     return result, "\n".join([*said, *([lie.sentence()] if lie else [])]), (*written, "axes.json")
 
 
@@ -395,73 +386,15 @@ def _diagnose(
     measured: Sequence[Campaign], model: Path, output: Path, *, calibrate: int = 0, seed: int = 0
 ) -> tuple[Diagnosis, str]:
     """Diagnose one axis and write the results; and the verdict in a sentence."""
-    _prepare(output, model)
+    prepare_folder(output, model)
     from gyromodel.diagnosis import diagnose as diagnose_campaigns
     from gyromodel.model_files import read_model, write_model
     from gyromodel.report import sentence, write_report
 
     start = read_model(model)
-    with _progress() as progress:
+    with progress_bar() as progress:
         diagnosis: Diagnosis = diagnose_campaigns(measured, start, calibrate=calibrate, seed=seed, progress=progress)
     write_model(diagnosis.extended, output / "model.yaml")
-    write_text(output / "diagnosis.json", _json(diagnosis.to_dict() | {"model": "model.yaml"}))
+    write_text(output / "diagnosis.json", json_text(diagnosis.to_dict() | {"model": "model.yaml"}))
     write_report(diagnosis, output)
     return diagnosis, sentence(diagnosis)
-
-
-def _read(paths: Sequence[Path], axis: str | None) -> list[Campaign]:
-    from gyromodel.files import read_campaign
-
-    measured = [read_campaign(path) for path in paths]
-    return [campaign.axis(axis) for campaign in measured] if axis else measured
-
-
-def _prepare(folder: Path, model: Path) -> None:
-    """Refuse or make the folder for results before the work, so that a wrong place costs no time."""
-    _refuse_overwriting(folder / "model.yaml", [model])
-    folder.mkdir(parents=True, exist_ok=True)
-
-
-def _refuse_overwriting(target: Path, inputs: Sequence[Path]) -> None:
-    for path in inputs:
-        if target.exists() and path.exists() and target.samefile(path):
-            raise typer.BadParameter(f"would overwrite {path}, which is read: name another", param_hint="--output")
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[str, float], None] | None]:
-    """A callback (what is being done, share done) that draws a bar on standard error when that is a terminal."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    from rich.console import Console
-    from rich.progress import Progress
-
-    with Progress(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=1.0)
-        yield lambda text, share: bar.update(task, description=text, completed=share)
-
-
-def _json(value: Any) -> str:
-    return json.dumps(_plain(value), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def _plain(value: Any) -> Any:
-    """The value as JSON can hold it: arrays as lists, and null where there is no finite number."""
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, Mapping):
-        return {str(key): _plain(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
-    for row in [header, *rows]:
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
-
-
-def _print_paths(folder: Path, *names: str) -> None:
-    print("\n" + "\n".join(str(folder / name) for name in names))

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gyromodel import cli
+from gyromodel import _console, cli
 from gyromodel.campaign import Campaign
 from gyromodel.files import read_campaign, write_campaign
 
@@ -568,7 +568,7 @@ def test_what_nobody_foresaw_is_one_sentence_too(bench: Path, run: Run, monkeypa
 
 
 def test_json_has_null_where_there_is_no_number():
-    assert json.loads(cli._json({"a": float("nan"), "b": [float("inf"), 1.5], 3: ("x", None)})) == {
+    assert json.loads(_console.json_text({"a": float("nan"), "b": [float("inf"), 1.5], 3: ("x", None)})) == {
         "a": None,
         "b": [None, 1.5],
         "3": ["x", None],

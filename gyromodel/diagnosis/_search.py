@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from gyromodel.diagnosis._drivers import smooth_columns
-from gyromodel.diagnosis._evidence import log_evidence_ratio, log_sum
-from gyromodel.diagnosis._lines import RESOLVED
+from gyromodel.diagnosis._evidence import log_sum
+from gyromodel.diagnosis._forms import MAXIMUM_LINES, addition
 from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise, line_frequencies, rank_where_it_matters
-from gyromodel.diagnosis._scan import Scanner, Tangent
+from gyromodel.diagnosis._scan import Scanner
 from gyromodel.effects import Effect
-from gyromodel.effects.drivers import BiasPeriodic, BiasStep
 from gyromodel.estimate import Estimate, EstimateError, fit_record
 from gyromodel.model import GyroModel
 from gyromodel.noise import NoiseRatios
@@ -27,12 +24,8 @@ NoisePath = Sequence[NoiseRatios]
 MAXIMUM_ROUNDS = 12
 # An earlier choice is exchanged when another candidate beats it by this many nats given all the others.
 EXCHANGE = 2.0
-# More lines than this are a spectrum, and more steps a function of time, that nobody explains by naming each.
-MAXIMUM_LINES, MAXIMUM_STEPS = 6, 3
-# A further line found in the same pass must exceed the leakage of stronger ones this many times.
-ABOVE_LEAKAGE = 4.0
-# … and have this evidence (nats) by itself, the search over frequencies paid for.
-LINE_MARGIN = 8.0
+# More steps than this are a function of time that nobody explains by naming each.
+MAXIMUM_STEPS = 3
 # Lines that lead every other name by this much (nats) are not chosen again.
 LINE_LEAD = 20.0
 # Functions of time that one run cannot tell from a random walk, and the lead (nats) over it at which they are put
@@ -114,7 +107,7 @@ def search(
         steps = [i for i, f in enumerate(path) if f.name == "bias_step"]
         if name == "bias_step" and len(steps) >= MAXIMUM_STEPS:
             return _before(steps[0], path, estimates)
-        step = _addition(scanner, estimate, ranking, name, pulses)
+        step = Found(name, *addition(scanner, estimate, ranking, name, pulses), ranking)
         after = refit(record, baseline, standing([*path, step]), noise)
         if after is None:
             remains = name
@@ -189,95 +182,6 @@ def _slow_structure(ranking: Ranking, name: str, score: float, threshold: float,
     logs = np.array([ranking.results[g].log_likelihood + ranking.log_prior[g] for g in still])
     each = np.array([ranking.results[g].evidence.get(name, -np.inf) for g in still])
     return bool(still) and log_sum(logs + each) - log_sum(logs) > threshold
-
-
-def _addition(scanner: Scanner, estimate: Estimate, ranking: Ranking, name: str, pulses: tuple[int, ...]) -> Found:
-    """A named candidate as an effect at its best form, as rows given up, or as noise that is not stated."""
-    if is_noise(name):
-        return Found(name, None, (), ranking)
-    form, _, _ = ranking.best_form(name)
-    if name == "outliers":
-        rows = form if isinstance(form, tuple) else (form,)
-        return Found(name, None, tuple(int(r) for r in rows), ranking)
-    assert isinstance(form, int)
-    if name in ranking.tangents:
-        return Found(
-            name, _grown(scanner, estimate, ranking.tangents[name], ranking.best_cell(name), pulses), (), ranking
-        )
-    fixed = [e for e in estimate.model.effects if e.label == name and name in estimate.model.wholly_fixed()]
-    effect = fixed[0] if fixed else form_effect(scanner, name, form)
-    assert effect is not None
-    if isinstance(effect, BiasPeriodic):
-        frequency = np.append(line_frequencies(estimate.model), _lines(scanner, ranking, estimate.model))
-        none = jnp.zeros(len(frequency))
-        effect = BiasPeriodic(cosine=none, sine=none, frequency=jnp.asarray(frequency))
-    return Found(name, _solved(scanner, estimate, effect, ranking.best_cell(name), pulses).settled(), (), ranking)
-
-
-def _lines(scanner: Scanner, ranking: Ranking, model: GyroModel) -> np.ndarray:
-    """Frequencies of the best line and of others in the same pass that stand by themselves."""
-    assert scanner.lines is not None
-    result = ranking.results[ranking.best_cell("bias_periodic")]
-    form, explained, _ = result.best["bias_periodic"]
-    assert isinstance(form, int)
-    chosen = {form: explained}
-    count, nu = len(scanner.lines.frequencies), scanner.degrees_of_freedom
-    for k, t in sorted(result.peaks.items(), key=lambda item: -item[1]):
-        if min(abs(k - j) for j in chosen) < RESOLVED:
-            continue
-        # A line leaks as the square of 1/(π × its distance in steps of the record's resolution, a quarter of which
-        # is the grid's).
-        leakage = sum(other / (0.25 * np.pi * abs(k - j)) ** 2 for j, other in chosen.items())
-        alone = float(log_evidence_ratio(np.array(t), result.rss, nu, 2)) - np.log(count)
-        if alone > LINE_MARGIN and t > ABOVE_LEAKAGE * leakage:
-            chosen[k] = t
-    room = max(MAXIMUM_LINES - len(line_frequencies(model)), 1)
-    return scanner.lines.frequencies[list(chosen)[:room]]
-
-
-def form_effect(scanner: Scanner, name: str, form: int) -> Effect | None:
-    """The effect behind a form number."""
-    if name == "bias_step":
-        time = np.asarray(scanner.record.signals["time"])
-        return BiasStep(epoch=jnp.asarray(float(time[form] + time[form - 1]) / 2))
-    if name == "bias_periodic":
-        assert scanner.lines is not None
-        return BiasPeriodic(frequency=jnp.asarray(scanner.lines.frequencies[[form]]))
-    return scanner.bank.blocks[form].effect
-
-
-def _solved(scanner: Scanner, estimate: Estimate, effect: Effect, g: int, pulses: tuple[int, ...]) -> Effect:
-    """The effect at the coefficients that fit best beside the baseline, in one noise cell."""
-    model = estimate.model
-    model = GyroModel(tuple(e for e in model.effects if e.label not in effect.supersedes), {}, model.fixed, model.gyro)
-    if effect.site == "gain":
-        return effect
-    columns = model.columns_of(effect, scanner.record.signals)
-    return effect.with_linear(_coefficients(scanner, model, columns, g, pulses))
-
-
-def _grown(scanner: Scanner, estimate: Estimate, tangent: Tangent, g: int, pulses: tuple[int, ...]) -> Effect:
-    """An effect that continues others, at the amplitude that fits best beside them."""
-    effect, column = tangent.effect, jnp.asarray(tangent.column)[:, None] * estimate.model.gain()
-    best = _coefficients(scanner, estimate.model, column, g, pulses)
-    name = [k for k, declared in effect.declared().items() if not declared.linear][-1]
-    return replace(effect, **{name: jnp.clip(best[0], -effect.reach, effect.reach)})
-
-
-def _coefficients(
-    scanner: Scanner, model: GyroModel, columns: Array, g: int, pulses: tuple[int, ...]
-) -> Float[Array, " coefficient"]:
-    """The coefficients of columns that fit best beside a model, in one noise cell."""
-    record = scanner.record
-    predicted, jacobian = model.linearise(record.signals)
-    residual = jnp.where(record.sampling.present, record.signals["output"] - predicted, 0.0)
-    marks = jnp.zeros((len(residual), len(pulses))).at[jnp.asarray(pulses, int), jnp.arange(len(pulses))].set(1.0)
-    stacked = jnp.column_stack([jacobian, marks, columns, residual])
-    w = np.asarray(scanner.cells.whiten(g, stacked))[:, : stacked.shape[1]]
-    norm = np.linalg.norm(w[:, :-1], axis=0)
-    norm[norm == 0] = 1.0
-    solution = np.linalg.lstsq(w[:, :-1] / norm, w[:, -1], rcond=1e-9)[0] / norm
-    return jnp.asarray(solution[-columns.shape[1] :])
 
 
 def refit(record: Record, baseline: Estimate, found: list[Found], noise: NoisePath = ()) -> Estimate | None:
@@ -388,7 +292,8 @@ def _exchange(
             base = refit(record, baseline, others, noise)
             if base is None:
                 continue
-            step = _addition(scanner, base, ranking, name, tuple(r for f in others for r in f.rows))
+            pulses = tuple(r for f in others for r in f.rows)
+            step = Found(name, *addition(scanner, base, ranking, name, pulses), ranking)
             changed = [*others[:i], step, *others[i:]]
             if len(standing(changed)) < len(changed):
                 continue

@@ -8,13 +8,11 @@ import numpy as np
 from gyromodel.diagnosis._bank import PART_OF
 from gyromodel.diagnosis._drivers import driver_unit, smooth_columns
 from gyromodel.diagnosis._evidence import explained_for
+from gyromodel.diagnosis._forms import form_effect
 from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise, skipped
 from gyromodel.diagnosis._result import Driver
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._search import (
-    Selection,
-    form_effect,
-)
+from gyromodel.diagnosis._search import Selection
 from gyromodel.effects import Effect
 from gyromodel.estimate import Estimate
 from gyromodel.model import GyroModel, parameter_unit
