@@ -10,7 +10,7 @@ demo: $(READY)
 	$(BIN)/gyromodel demo
 
 test: $(READY)
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n $(TEST_WORKERS) --dist worksteal
+	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/pytest -n $(TEST_WORKERS) --dist worksteal
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -21,7 +21,7 @@ from tests.truth.verdicts import ACCEPTED
 # Engine calls; tuned so that the file takes minutes on two cores.
 NULLS, MOVING, STRANGE = 20, 5, 5  # in noise of the family, the same on the move, in other noise anywhere
 NAMES = len({e for d in HOMES for e in TESTABLE[d]})
-EFFECTS_1, EFFECTS_3, EFFECTS_10 = 4, NAMES, 5  # at 3 x MDE every effect, else some of them
+EFFECTS_1, EFFECTS_3, EFFECTS_10 = 4, 15, 5  # other effects each run
 UNKNOWN_3, UNKNOWN_10 = 8, 4  # of 8 uncatalogued effects
 RETRIES = 5  # further draws of an effect that was missed once
 WORKERS = 1 if "PYTEST_XDIST_WORKER" in os.environ else 2
@@ -99,6 +99,6 @@ def test_an_effect_whose_fit_fails_is_not_found_twice():
 
 
 def test_every_effect_and_uncatalogued_shape_is_in_a_campaign():
-    hidden = {c.effect for c in study.effect_cases(EFFECTS_3, 0, 3.0)}
+    hidden = {c.effect for c in study.effect_cases(NAMES, 0, 3.0)}
     assert hidden == {e for d in HOMES for e in TESTABLE[d]}
     assert {c.effect for c in study.unknown_cases(UNKNOWN_3, 0, 3.0)} == {e for n in UNCATALOGUED.values() for e in n}

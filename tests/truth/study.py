@@ -279,7 +279,8 @@ def run_cases(cases: list[Case], workers: int = 1, **options: Any) -> list[Recor
     """Run cases, in fresh processes when there are several workers (JAX does not fork)."""
     if workers == 1:
         return [run_case(case, **options) for case in cases]
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read by the new processes, which would fight for the cores
+    # Read by the new processes, which would fight for the cores.
+    os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         futures = [pool.submit(run_case, case, **options) for case in cases]
         return [f.result() for f in futures]
