@@ -105,3 +105,14 @@ def test_the_next_test_settles_what_was_ambiguous(seed: int, effect: str):
     assert settled is not None
     # A slow warm-up may still stand for a drift.
     assert {"bias_temperature", "bias_drift"} & set(settled) == {effect}
+
+
+@pytest.mark.parametrize("hidden", ["bias_temperature", "bias_drift"])
+def test_a_change_that_a_walk_could_make_is_told_under_any_name(hidden: str):
+    """On one ramp temperature and time are one, and a random walk rises as they do: an example with a fixed seed."""
+    built = study.build(study.Case(3, "static_ramp", "white", hidden, 3.0))
+    measured = gyromodel.Campaign(columns=built.columns, units=built.units, metadata=built.metadata)
+    model = gyromodel.model_from_effects(list(built.truth.baseline))
+    found = gyromodel.diagnose(measured, model, hold_out=False)
+    assert found.verdict == "ambiguous"
+    assert {"bias_temperature", "bias_drift", "noise_random_walk"} <= set(found.credible_set)

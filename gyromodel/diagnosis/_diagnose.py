@@ -170,7 +170,11 @@ def diagnose(
             "do."
         )
     judgement = judge(record, session.scanner, baseline, selection, extended, len(bank.names()), nulls)
-    stepped = quantisation(selection.estimate, session.threshold)
+    # Less noise than the model states would be whitened too far, and look like quantisation.
+    free = selection.estimate
+    if free.noise_given:
+        free = fit_record(free.record, GyroModel(free.model.effects, {}, free.model.fixed, free.model.gyro))
+    stepped = quantisation(free, session.threshold)
     if stepped is not None:
         beyond.append(stepped)
         size = stepped.parameters[0].value

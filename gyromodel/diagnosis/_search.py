@@ -174,9 +174,16 @@ def standing(path: Sequence[Found]) -> list[Found]:
     return kept[::-1]
 
 
+def like(ranking: Ranking, name: str, others: Sequence[str]) -> bool:
+    """Whether a candidate is one of some names, or explains the same data as one of them."""
+    if name in others or name == "outliers" or name not in ranking.results[ranking.best_cell(name)].best:
+        return name in others
+    return not ranking.twins(name).isdisjoint(others)
+
+
 def _slow_structure(ranking: Ranking, name: str, score: float, threshold: float, runs: int) -> bool:
     """Whether a slow change in time is certain, and only a random walk keeps its cause from being so."""
-    if name not in SLOW_IN_TIME or score < SLOW_LEAD or runs > 1:
+    if score < SLOW_LEAD or runs > 1 or not like(ranking, name, SLOW_IN_TIME):
         return False
     still = [g for g, walks in ranking.walks.items() if not walks]
     logs = np.array([ranking.results[g].log_likelihood + ranking.log_prior[g] for g in still])

@@ -20,6 +20,7 @@ from gyromodel.diagnosis._search import (
     Found,
     Selection,
     leave_one_out,
+    like,
     uncontested,
 )
 from gyromodel.diagnosis._shapes import remaining, separation
@@ -59,8 +60,8 @@ def credible(
     # A step at the edge of the record is a gross error as well.
     apart = beside | (set() if name in ("outliers", "bias_step") else {"outliers"})
     own = {k: v for k, v in ranking.statistic.items() if not is_driver(k) and (k == name or k not in apart)}
-    hidden_by_walk = name in NO_EDGE and ranking.walks[ranking.best_cell(name)]
-    too_close = name in SLOW_IN_TIME and statistic < TIME_MARGIN and ranking.slow_noise
+    hidden_by_walk = like(ranking, name, NO_EDGE) and ranking.walks[ranking.best_cell(name)]
+    too_close = statistic < TIME_MARGIN and ranking.slow_noise and like(ranking, name, SLOW_IN_TIME)
     if name not in ("outliers", "bias_step", "bias_periodic") and not is_noise(name):
         # Only the number of forms and coefficients sets them apart, which is no evidence.
         own |= {k: max(own[k], own[name]) for k in ranking.twins(name) & own.keys()}
