@@ -113,8 +113,8 @@ def judge(
         statistic = ranking.statistic[name]
         beside = frozenset(f.name for f in found if f is not step)
         # Where more is left than this explains, this may be a part of it.
-        if selection.last.statistic.get(selection.remains, -np.inf) < statistic:
-            beside |= {selection.remains}
+        left = selection.last.statistic.get(selection.remains, -np.inf)
+        beside = beside - {selection.remains} if left > statistic else beside | {selection.remains}
         members = credible(ranking, name, statistic, runs=runs, beside=beside)
         if name == "outliers":
             if scanner.by_points and _unrepeated(record, step.rows):
