@@ -73,6 +73,17 @@ def test_other_noise_is_neither(kind: str, rng: np.random.Generator):
     assert binom.sf(false - 1, 10, 0.01) > RARE
 
 
+def test_a_regular_switch_is_no_firm_noise():
+    """An example with a fixed seed: a square wave is as well something that switches near the gyro."""
+    wave = 3.0 * WHITE / np.sqrt(STEP) * np.sign(np.sin(2 * np.pi * np.arange(ROWS) / 75))
+    output = white(np.random.default_rng(2)) + wave
+    for model in (stated(), gm.model_from_effects(["bias"])):
+        found = gm.diagnose(log(output), model, hold_out=False)
+        assert found.verdict == "ambiguous"
+        assert set(found.credible_set) == {"noise_telegraph", "bias_periodic"}
+        assert "switches" in (found.next_test or "")
+
+
 def test_kinds_of_noise_that_are_not_stated_are_causes():
     """Examples of a fixed seed: stated as white, and to be estimated, where only hops are no noise that a fit holds."""
     rng = np.random.default_rng(4)

@@ -154,7 +154,9 @@ def diagnose(
     hops = telegraph(baseline, selection.estimate, unit) if _like_hops(selection) else None
     if hops is not None:
         beyond.append(hops)
-        selection = Selection(baseline, (), (), selection.last, (baseline,), None)
+        findings.append("No fit holds hops of the bias: the extended model takes them for coloured noise.")
+        first = selection.path[0].ranking if selection.path else selection.last
+        selection = Selection(baseline, (), (), first, (baseline,), None)
     if hold_out:
         say("judging each step on blocks left out", 0.62)
         selection = session.pruned(selection)
@@ -170,11 +172,7 @@ def diagnose(
             "do."
         )
     judgement = judge(record, session.scanner, baseline, selection, extended, len(bank.names()), nulls)
-    # Less noise than the model states would be whitened too far, and look like quantisation.
-    free = selection.estimate
-    if free.noise_given:
-        free = fit_record(free.record, GyroModel(free.model.effects, {}, free.model.fixed, free.model.gyro))
-    stepped = quantisation(free, session.threshold)
+    stepped = quantisation(_with_noise_estimated(selection.estimate), session.threshold)
     if stepped is not None:
         beyond.append(stepped)
         size = stepped.parameters[0].value
@@ -252,6 +250,15 @@ def _rate_unit(campaign: Campaign) -> str:
         if name in campaign.units and convertible(campaign.units[name], "rad/s"):
             return campaign.units[name]
     return "deg/s"
+
+
+def _with_noise_estimated(estimate: Estimate) -> Estimate:
+    """The fit with its noise estimated: less than a model states would be whitened too far, and look quantised."""
+    if estimate.noise_given:
+        free = GyroModel(estimate.model.effects, {}, estimate.model.fixed, estimate.model.gyro)
+        with contextlib.suppress(EstimateError):
+            return fit_record(estimate.record, free)
+    return estimate
 
 
 def _like_hops(selection: Selection) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,10 +19,14 @@ from gyromodel.units import factor
 STRETCH = 16
 # Quantisation variances over white ones that are tried.
 SHARES = np.geomspace(1e-3, 1e3, 61)
+# Power at one frequency beyond so many times the median is a line's: noise alone exceeds it once in 10⁵ frequencies.
+LINE = 42.0
 # A record with fewer hops than this has steps, each with an epoch of its own; fewer rows show no hops.
 FEWEST_HOPS, FEWEST_ROWS = 4, 100
 # Lead (nats) over coloured noise and steps from which hops are told.
 HOPS_LEAD = 10.0
+# Standard deviation of held times over their mean from which on nothing regular switches; of random hops it is one.
+IRREGULAR = 0.5
 # Each level is held for four samples or more, and for this part of the record: heavy tails are no second level.
 LEAST_HELD = 0.05
 # Middle and half distance of the levels (ln), scatter about them (ln), chances of a hop a sample (logit) up and down.
@@ -43,15 +49,14 @@ def quantisation(estimate: Estimate, threshold: float) -> Cause | None:
     opens = np.asarray(record.sampling.restart)[:rows] | (
         np.asarray(record.sampling.interval)[:rows] > 1.5 * record.interval
     )
-    group = np.cumsum(opens | ~known)
-    stretches = [
-        estimate.whitened[known & (group == g)]
-        for g in np.unique(group[known])
-        if np.sum(known & (group == g)) >= STRETCH
-    ]
+    ends = np.flatnonzero(opens | ~known)
+    stretches = [e[np.isfinite(e)] for e in np.split(estimate.whitened, ends)]
+    stretches = [e for e in stretches if len(e) >= STRETCH]
     if not stretches:
         return None
     power = np.concatenate([np.square(np.asarray(dst(e, type=1, norm="ortho"))) for e in stretches])
+    # Steady lines are no quantisation, however fast.
+    power = np.minimum(power, LINE * np.median(power))
     spectrum = np.concatenate([2.0 - 2.0 * np.cos(np.pi * np.arange(1, len(e) + 1) / (len(e) + 1)) for e in stretches])
     variance = 1.0 + SHARES[:, None] * spectrum
     white = (power / variance).mean(1)
@@ -73,7 +78,10 @@ def quantisation(estimate: Estimate, threshold: float) -> Cause | None:
 
 
 def telegraph(baseline: Estimate, extended: Estimate, unit: str) -> Cause | None:
-    """Hops to and fro between two levels in what the baseline leaves, where no coloured noise or steps explain it."""
+    """Hops to and fro between two levels in what the baseline leaves, where no coloured noise or steps explain it.
+
+    At a regular pace they may as well be something that switches: then the cause has half of the posterior.
+    """
     record = baseline.record
     residual, here = baseline.residual, np.isfinite(baseline.residual)
     count = int(here.sum())
@@ -95,12 +103,14 @@ def telegraph(baseline: Estimate, extended: Estimate, unit: str) -> Cause | None
     lead = -best.fun - other - 0.5 * (len(best.x) - 2 - extra) * np.log(count)
     if hops < FEWEST_HOPS or lead < HOPS_LEAD or not LEAST_HELD < upper.mean() < 1.0 - LEAST_HELD:
         return None
+    held = np.diff(np.flatnonzero(np.diff(upper)))
+    scatter = np.concatenate([part / part.mean() for part in (held[::2], held[1::2]) if len(part)]).std()
     _, half, sigma, up, down = best.x
     size = 2.0 * np.exp(half) * residual[here].std() / abs(float(baseline.model.gain()))
     std = 2.0 * np.exp(sigma) * residual[here].std() / abs(float(baseline.model.gain())) / np.sqrt(count / 4.0)
     dwell = [record.interval * (1.0 + np.exp(-rate)) for rate in (up, down)]
     scale = factor("rad/s", unit)
-    return as_cause(
+    cause = as_cause(
         "noise_telegraph",
         float(lead),
         ParameterValue("size", size * scale, std * scale, unit),
@@ -109,14 +119,14 @@ def telegraph(baseline: Estimate, extended: Estimate, unit: str) -> Cause | None
             for name, t in zip(("time_low", "time_high"), dwell, strict=True)
         ),
     )
+    return cause if scatter >= IRREGULAR else replace(cause, posterior=0.5)
 
 
 def _starts(y: np.ndarray) -> list[np.ndarray]:
-    """Levels at the means of the upper and lower half of samples, or of short means of them."""
+    """Levels at the quartiles of samples, or of short means of them."""
     starts = []
     for m in (1, 8):
-        smooth = np.convolve(y, np.full(m, 1.0 / m), mode="same")
-        low, high = smooth[smooth < np.median(smooth)].mean(), smooth[smooth >= np.median(smooth)].mean()
+        low, high = np.quantile(np.convolve(y, np.full(m, 1.0 / m), mode="same"), [0.25, 0.75])
         half = max((high - low) / 2.0, 0.05)
         starts.append(np.array([(low + high) / 2.0, np.log(half), np.log(max(1.0 - half**2, 0.05)) / 2.0, -4.0, -4.0]))
     return starts

@@ -175,6 +175,20 @@ def with_noise(judgement: Judgement, beyond: Sequence[Cause]) -> Judgement:
     """The judgement with kinds of noise that the simulation lacks beside what else it lacks."""
     if not beyond:
         return judgement
+    regular = [c for c in beyond if c.posterior < 1.0]
+    if regular:
+        # Hops at a regular pace, which something that switches makes as well.
+        rival = Cause("bias_periodic", (), regular[0].statistic, regular[0].p_value, regular[0].p_adjusted, 0.5)
+        others = [c for c in beyond if c not in regular]
+        test = "Log again with what switches nearby (chamber, heater, pump) off: hops of the gyro itself go on."
+        shares = {c.effect: c.posterior for c in (*regular, rival)}
+        return replace(
+            judgement,
+            verdict="ambiguous",
+            causes=(*regular, rival, *judgement.causes, *others),
+            credible_set=shares,
+            next_test=test,
+        )
     if judgement.verdict == "adequate":
         judgement = replace(judgement, verdict="named", credible_set={beyond[0].effect: 1.0})
     return replace(judgement, causes=(*judgement.causes, *beyond))
