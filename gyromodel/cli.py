@@ -13,6 +13,7 @@ import typer
 
 import gyromodel
 from gyromodel._atomic import write_text
+from gyromodel._cache import keep_compiled
 from gyromodel._console import (
     json_text,
     prepare_folder,
@@ -51,6 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")  # an equation's ε must not stop a terminal that lacks it
+    keep_compiled()
     try:
         typer.main.get_command(app)(args=arguments, prog_name="gyromodel")
     except Exception as error:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gyromodel import _console, cli
+from gyromodel import _cache, _console, cli
 from gyromodel.campaign import Campaign
 from gyromodel.files import read_campaign, write_campaign
 
@@ -565,6 +566,25 @@ def test_what_nobody_foresaw_is_one_sentence_too(bench: Path, run: Run, monkeypa
     monkeypatch.setenv("GYROMODEL_DEBUG", "1")
     with pytest.raises(RuntimeError, match="broken"):
         cli.main([str(argument) for argument in arguments])
+
+
+def test_compiled_code_is_kept_where_that_is_possible(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def kept(home: Path) -> str | None:
+        monkeypatch.setenv("XDG_CACHE_HOME", str(home))
+        monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+        _cache.keep_compiled()
+        return os.environ.get("JAX_COMPILATION_CACHE_DIR")
+
+    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+    found = Path(kept(tmp_path) or "")
+    assert found.is_dir()
+    assert tmp_path in found.parents
+    (tmp_path / "file").write_text("")
+    assert kept(tmp_path / "file") is None
+    # What the user has set stays.
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "mine")
+    _cache.keep_compiled()
+    assert os.environ["JAX_COMPILATION_CACHE_DIR"] == "mine"
 
 
 def test_json_has_null_where_there_is_no_number():

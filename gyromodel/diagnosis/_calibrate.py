@@ -9,12 +9,13 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable
-from pathlib import Path
+from contextlib import suppress
 
 import jax
 import numpy as np
 
 from gyromodel import __version__
+from gyromodel._cache import cache_folder
 from gyromodel.diagnosis._ranking import cells_of_weight, rank, skipped, tangents
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.estimate import Estimate, filter_of
@@ -40,7 +41,7 @@ def null_scores(
         say: progress.
     """
     columns = np.asarray(baseline.model.linearise(scanner.record.signals)[1])
-    kept = _cache_folder() / f"{_design(scanner, baseline, columns, draws, seed)}.npy"
+    kept = cache_folder("thresholds") / f"{_design(scanner, baseline, columns, draws, seed)}.npy"
     if kept.exists():
         return np.load(kept)
     skip = skipped(baseline.model, scanner.record.signals)
@@ -62,15 +63,12 @@ def null_scores(
         scores.append(np.max(each, axis=0) - np.logaddexp.reduce(logs))
         say("calibrating the threshold", 0.06 + 0.18 * min(1.0, (start + DRAWS_TOGETHER) / draws))
     found = np.concatenate(scores)[:draws]
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    part = kept.with_suffix(f".{os.getpid()}.npy")
-    np.save(part, found)
-    part.replace(kept)
+    with suppress(OSError):
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        part = kept.with_suffix(f".{os.getpid()}.npy")
+        np.save(part, found)
+        part.replace(kept)
     return found
-
-
-def _cache_folder() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "gyromodel" / "thresholds"
 
 
 def _design(scanner: Scanner, baseline: Estimate, columns: np.ndarray, draws: int, seed: int) -> str:

@@ -212,7 +212,14 @@ def refit(record: Record, baseline: Estimate, found: list[Found], noise: NoisePa
     freed = [f.name for f in found if f.frees_noise]
     for attempt in (model, _shapes_held(model, found)):
         try:
-            return fit_record(data, attempt, ratios=ratios, markov="noise_markov" in freed if freed else None)
+            # Another solver would be compiled anew for each model, and has rescued none that this one lost.
+            return fit_record(
+                data,
+                attempt,
+                ratios=ratios,
+                markov="noise_markov" in freed if freed else None,
+                solver="levenberg_marquardt",
+            )
         except EstimateError:
             continue
     return None

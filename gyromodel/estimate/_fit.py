@@ -31,7 +31,7 @@ from gyromodel.numerics.uncertain import Source
 from gyromodel.poses import at_rest
 from gyromodel.signals import Record, read_signals
 
-Solver = Literal["levenberg_marquardt", "optimistix"]
+Solver = Literal["auto", "levenberg_marquardt", "optimistix"]
 Progress = Callable[[str, float], None] | None
 
 # Relative decrease of the cost that still counts: at a million samples a hundredth of a standard deviation squared.
@@ -52,7 +52,7 @@ def fit(
     campaigns: Campaign | Sequence[Campaign],
     model: GyroModel,
     *,
-    solver: Solver = "levenberg_marquardt",
+    solver: Solver = "auto",
     progress: Progress = None,
     name: str = "campaign",
 ) -> Estimate:
@@ -63,7 +63,8 @@ def fit(
             where the reference rate comes from an attitude, means over 0.2 s.
         model: what to fit; `noise` empty estimates white noise and flicker and random walk, or a Markov process,
             alongside.
-        solver: the package's own solver, or optimistix's.
+        solver: the package's own Levenberg-Marquardt, or optimistix's; "auto" is its own and, where that does not
+            converge, optimistix's.
         progress: called with a line and the fraction done.
         name: what these data are called where their part in a later result's uncertainty is told.
 
@@ -90,7 +91,7 @@ def fit_record(
     *,
     ratios: NoiseRatios | None = None,
     markov: bool | None = None,
-    solver: Solver = "levenberg_marquardt",
+    solver: Solver = "auto",
     ordinary: bool = False,
 ) -> Estimate:
     """As `fit`, on signals already read.
@@ -175,7 +176,7 @@ _gram = jax.jit(whitened_gram)
 
 
 def solve(model: GyroModel, x: np.ndarray, record: Record, filter: Filter, solver: Solver) -> Solution:
-    """Minimise the whitened sum of squares; optimistix takes over where the own solver does not converge."""
+    """Minimise the whitened sum of squares."""
     output, present = np.asarray(record.signals["output"]), np.asarray(filter.present)
     steady = model.steady_columns(record.signals)
 
@@ -188,9 +189,9 @@ def solve(model: GyroModel, x: np.ndarray, record: Record, filter: Filter, solve
 
     if not len(x):
         return Solution(x, normal(x)[2], 0, True)
-    if solver == "levenberg_marquardt":
+    if solver != "optimistix":
         solution = levenberg_marquardt(normal, np.asarray(x), TOLERANCE)
-        if solution.converged and np.isfinite(solution.x).all():
+        if solver == "levenberg_marquardt" or (solution.converged and np.isfinite(solution.x).all()):
             return solution
     return optimistix_solution(model, jnp.asarray(x), record.signals, filter)
 

@@ -59,9 +59,10 @@ def levenberg_marquardt(
         step = -cho_solve(factor, g / scale) / scale
         promise = -float(g @ step)
         if promise <= tolerance * cost:
-            # Under heavy damping a small promise says nothing: then the residual must be orthogonal to every column.
+            # Under heavy damping a small promise says nothing: then the residual must be orthogonal to every column, or
+            # every shorter step must have been refused, as where the sum of squares has a kink.
             orthogonal = np.all(np.abs(g) <= 1e-6 * scale * np.sqrt(cost))
-            return Solution(x, cost, iteration, bool(damping < 1.0 or orthogonal))
+            return Solution(x, cost, iteration, bool(damping < 1.0 or growth > 2.0 or orthogonal))
         a_new, g_new, cost_new = normal(x + step)
         if _finite(a_new, g_new, cost_new) and cost_new <= cost:
             decrease = cost - cost_new
