@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from itertools import groupby
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,9 +27,9 @@ from gyromodel.numerics.state_space import (
 )
 
 COLUMN_STEP = 16
-# Cells filtered side by side, rows whitened at a time, and about as many columns in one Gram matrix of whole blocks:
-# they stay in cache.
-CELLS_TOGETHER, ROWS_TOGETHER, GRAM_COLUMNS = 8, 1024, 24
+# Cells filtered side by side, rows and columns whitened at a time, and about as many columns in one Gram matrix of
+# whole blocks: they stay in cache.
+CELLS_TOGETHER, ROWS_TOGETHER, COLUMNS_TOGETHER, GRAM_COLUMNS = 8, 1024, 192, 24
 # Data are whitened in several cells side by side for at most this many columns: beyond, one alone keeps the processor
 # busy.
 FEW_COLUMNS, FEW_STEP = 12, 4
@@ -58,6 +59,17 @@ class Cell:
 NO_LINES = np.zeros((0, 2, 2))
 
 
+class Pack(NamedTuple):
+    """Whole blocks of columns that are whitened together.
+
+    `rows` are the columns, some rows at a time; of each part: the width of its blocks (of the lines' 2 × 2: none), the
+    first of them, how many, and where their columns begin.
+    """
+
+    rows: list[jax.Array]
+    parts: list[tuple[int | None, int, int, int]]
+
+
 class Cells:
     """The noise cells of a grid, each prepared at first use."""
 
@@ -65,10 +77,13 @@ class Cells:
         self._sampling, self._grid, self._lines = sampling, grid, lines
         self._columns, self._layout = bank.columns, bank.layout()
         self._cells: dict[int, Cell] = {}
-        waves = lines.waves(lines.exact) if lines else np.zeros((len(bank.columns), 0))
-        raw = np.concatenate([bank.columns, waves], axis=1)
-        raw = np.pad(raw, ((0, 0), (0, -raw.shape[1] % COLUMN_STEP)))
-        self._raw = [jnp.asarray(raw[i : i + ROWS_TOGETHER]) for i in range(0, len(raw), ROWS_TOGETHER)]
+        blocks: list[tuple[int | None, int, int, np.ndarray]] = [
+            (q, q, count, bank.columns[:, start : start + q * count]) for q, (_, count, start) in self._layout.items()
+        ]
+        if lines:
+            pairs = lines.waves(lines.exact).reshape(len(bank.columns), 2, -1).transpose(0, 2, 1)
+            blocks.append((None, 2, len(lines.exact), pairs.reshape(len(pairs), -1)))
+        self._packs = _packed(blocks)
 
     def sampled(self, sampling: Sampling) -> Cells:
         """The same cells with other samples missing."""
@@ -106,25 +121,28 @@ class Cells:
 
     def _with_energies(self, cell: Cell) -> Cell:
         """CᵀV⁻¹C of every block and line, a few rows at a time."""
-        filter = Filter(*(np.asarray(part) for part in cell.filter))
-        state = at_rest(cell.filter, self._raw[0].shape[1])
-        blocks = {q: np.zeros((count, q, q)) for q, (_, count, _) in self._layout.items()}
-        first, lines = self._columns.shape[1], len(self._lines.exact) if self._lines else 0
-        waves = np.zeros((3, lines))
-        for i, raw in enumerate(self._raw):
-            here = slice(i * ROWS_TOGETHER, (i + 1) * ROWS_TOGETHER)
-            state, rows = _whiten_rows(state, Filter(*(part[here] for part in filter)), raw)
-            w = np.asarray(rows)
-            for q, (_, count, start) in self._layout.items():
-                together = max(GRAM_COLUMNS // q, 1)
-                for k in range(0, count, together):
-                    part = w[:, start + q * k : start + q * min(k + together, count)]
-                    many = part.shape[1] // q
-                    square = (part.T @ part).reshape(many, q, many, q)
-                    blocks[q][k : k + many] += square[np.arange(many), :, np.arange(many), :]
-            c, s = w[:, first : first + lines], w[:, first + lines : first + 2 * lines]
-            waves += np.stack([np.sum(x * y, axis=0) for x, y in ((c, c), (s, s), (c, s))])
-        return replace(cell, blocks=blocks, line=self._lines.energies(*waves) if self._lines else NO_LINES)
+        whole = [np.asarray(part) for part in cell.filter]
+        filters = [Filter(*(part[i : i + ROWS_TOGETHER] for part in whole)) for i in _row_starts(len(whole[0]))]
+        blocks: dict[int | None, np.ndarray] = {
+            q: np.zeros((count, q, q)) for q, (_, count, _) in self._layout.items()
+        }
+        blocks[None] = np.zeros((len(self._lines.exact) if self._lines else 0, 2, 2))
+        for pack in self._packs:
+            state = at_rest(cell.filter, pack.rows[0].shape[1])
+            for filter, rows in zip(filters, pack.rows, strict=True):
+                state, whitened = _whiten_rows(state, filter, rows)
+                w = np.asarray(whitened)
+                for key, first, count, start in pack.parts:
+                    q = key or 2
+                    together = max(GRAM_COLUMNS // q, 1)
+                    for k in range(0, count, together):
+                        part = w[:, start + q * k : start + q * min(k + together, count)]
+                        many = part.shape[1] // q
+                        square = (part.T @ part).reshape(many, q, many, q)
+                        blocks[key][first + k : first + k + many] += square[np.arange(many), :, np.arange(many), :]
+        pairs = blocks.pop(None)
+        line = self._lines.energies(pairs[:, 0, 0], pairs[:, 1, 1], pairs[:, 0, 1]) if self._lines else NO_LINES
+        return replace(cell, blocks=blocks, line=line)
 
     def whiten(self, g: int, columns: jax.Array) -> np.ndarray:
         """Columns whitened in one noise cell."""
@@ -160,3 +178,32 @@ class Cells:
         z = np.ascontiguousarray(z.transpose(0, 2, 1))
         cross = self._columns.T @ z.reshape(len(z), -1)
         return z.transpose(1, 0, 2), cross.reshape(-1, len(group), columns).transpose(1, 0, 2)
+
+
+def _row_starts(rows: int) -> range:
+    return range(0, rows, ROWS_TOGETHER)
+
+
+def _packed(groups: Sequence[tuple[int | None, int, int, np.ndarray]]) -> list[Pack]:
+    """Groups of blocks (key, width, number, columns) in packs of few widths, which are padded with zeros."""
+    packs: list[tuple[list[np.ndarray], list[tuple[int | None, int, int, int]]]] = [([], [])]
+    used = 0
+    for key, q, count, columns in groups:
+        k = 0
+        while k < count:
+            room = (COLUMNS_TOGETHER - used) // q
+            if not room and used:
+                packs.append(([], []))
+                used = 0
+                continue
+            many = min(max(room, 1), count - k)
+            packs[-1][0].append(columns[:, q * k : q * (k + many)])
+            packs[-1][1].append((key, k, many, used))
+            used, k = used + q * many, k + many
+    found = []
+    for parts, where in packs:
+        if parts:
+            raw = np.concatenate(parts, axis=1)
+            raw = np.pad(raw, ((0, 0), (0, -raw.shape[1] % (COLUMNS_TOGETHER // 2))))
+            found.append(Pack([jnp.asarray(raw[i : i + ROWS_TOGETHER]) for i in _row_starts(len(raw))], where))
+    return found
