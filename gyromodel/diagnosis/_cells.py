@@ -123,9 +123,7 @@ class Cells:
         """CᵀV⁻¹C of every block and line, a few rows at a time."""
         whole = [np.asarray(part) for part in cell.filter]
         filters = [Filter(*(part[i : i + ROWS_TOGETHER] for part in whole)) for i in _row_starts(len(whole[0]))]
-        blocks: dict[int | None, np.ndarray] = {
-            q: np.zeros((count, q, q)) for q, (_, count, _) in self._layout.items()
-        }
+        blocks: dict[int | None, np.ndarray] = {q: np.zeros((count, q, q)) for q, (_, count, _) in self._layout.items()}
         blocks[None] = np.zeros((len(self._lines.exact) if self._lines else 0, 2, 2))
         for pack in self._packs:
             state = at_rest(cell.filter, pack.rows[0].shape[1])

@@ -136,7 +136,7 @@ def diagnose(
         nulls = null_scores(session.scanner, baseline, calibrate, seed, say)
         session.threshold = max(float(np.quantile(nulls, 0.99)), 0.0)
     selection = session.run(baseline, say)
-    grows = growing_noise(record, selection.estimate)
+    grows = None if _unfinished(selection) else growing_noise(record, selection.estimate)
     unit = _rate_unit(campaigns[0])
     beyond: list[Cause] = []
     if grows is not None:
@@ -151,10 +151,11 @@ def diagnose(
         baseline = fit_record(record, model)
         session = _Session(Scanner(record, bank, grid, stated=baseline.noise_given), session.threshold)
         selection = session.run(baseline, say)
-    hops = telegraph(baseline, selection.estimate, unit) if _like_hops(selection) else None
+    free = _with_noise_estimated(selection.estimate)
+    hops = telegraph(baseline, free, unit) if _like_hops(selection, free) else None
     if hops is not None:
         beyond.append(hops)
-        findings.append("No fit holds hops of the bias: the extended model takes them for coloured noise.")
+        findings.append("No fit holds hops of the bias: the extended model takes them for noise of the kinds it holds.")
         first = selection.path[0].ranking if selection.path else selection.last
         selection = Selection(baseline, (), (), first, (baseline,), None)
     if hold_out:
@@ -172,7 +173,9 @@ def diagnose(
             "do."
         )
     judgement = judge(record, session.scanner, baseline, selection, extended, len(bank.names()), nulls)
-    stepped = quantisation(_with_noise_estimated(selection.estimate), session.threshold)
+    stepped = (
+        None if _unfinished(selection) else quantisation(_with_noise_estimated(selection.estimate), session.threshold)
+    )
     if stepped is not None:
         beyond.append(stepped)
         size = stepped.parameters[0].value
@@ -239,9 +242,17 @@ def _grid(record: Record, baseline: Estimate) -> NoiseGrid:
     grid = noise_grid(int(record.present.sum()), record.interval, record_span(record))
     if not baseline.noise_given:
         return grid
-    each = np.broadcast_arrays(*grid.ratios)
-    ratios = NoiseRatios(*(np.append(float(a), b) for a, b in zip(baseline.ratios, each, strict=True)))
-    return grid._replace(ratios=ratios, log_prior=np.concatenate([[0.0], grid.log_prior]))
+    stated, prior = baseline.ratios, grid.log_prior
+    each = [np.asarray(r) for r in np.broadcast_arrays(*grid.ratios)]
+    if float(stated.markov):
+        # Beside less of it than stated, which is none, as much: in the cells that can hold it.
+        room = each[0] == 0
+        level = np.stack(each)[:, room]
+        level[2:] = [[float(stated.markov)], [float(stated.constant)]]
+        each = [np.concatenate([a, b]) for a, b in zip(each, level, strict=True)]
+        prior = np.concatenate([prior, prior[room]])
+    ratios = NoiseRatios(*(np.append(float(a), b) for a, b in zip(stated, each, strict=True)))
+    return grid._replace(ratios=ratios, log_prior=np.concatenate([[0.0], prior]))
 
 
 def _rate_unit(campaign: Campaign) -> str:
@@ -261,10 +272,15 @@ def _with_noise_estimated(estimate: Estimate) -> Estimate:
     return estimate
 
 
-def _like_hops(selection: Selection) -> bool:
-    """Whether all that was found is what hops of the bias could be taken for."""
+def _unfinished(selection: Selection) -> bool:
+    """Whether structure is left that would pass for a kind of noise."""
+    return selection.driver is not None or bool(selection.remains)
+
+
+def _like_hops(selection: Selection, free: Estimate) -> bool:
+    """Whether all that was found is what hops of the bias could be taken for; `free` has its noise estimated."""
     in_time = all(f.frees_noise or f.name in (*SLOW_IN_TIME, "bias_periodic") for f in selection.found)
-    slow = any(float(r) > 0 for r in selection.estimate.ratios)
+    slow = any(float(r) > 0 for r in free.ratios)
     return in_time and selection.driver in (None, "smooth(time)") and (slow or bool(selection.found))
 
 

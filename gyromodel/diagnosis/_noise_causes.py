@@ -7,12 +7,15 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import stats
 from scipy.fft import dst
 from scipy.optimize import minimize
 
 from gyromodel.diagnosis._evidence import log_sum
 from gyromodel.diagnosis._result import Cause, ParameterValue
 from gyromodel.estimate import Estimate, filter_of
+from gyromodel.noise_analysis import quantum
+from gyromodel.signals import Record
 from gyromodel.units import factor
 
 # Even stretches shorter than this show no correlation from sample to sample.
@@ -21,6 +24,8 @@ STRETCH = 16
 SHARES = np.geomspace(1e-3, 1e3, 61)
 # Power at one frequency beyond so many times the median is a line's: noise alone exceeds it once in 10⁵ frequencies.
 LINE = 42.0
+# Of the power that a spectrum leads one to expect, this many times it are rare; that there are too many of them.
+RARE_POWER, TOO_MANY = 6.6, 1e-3
 # A record with fewer hops than this has steps, each with an epoch of its own; fewer rows show no hops.
 FEWEST_HOPS, FEWEST_ROWS = 4, 100
 # Lead (nats) over coloured noise and steps from which hops are told.
@@ -30,7 +35,12 @@ IRREGULAR = 0.5
 # Each level is held for four samples or more, and for this part of the record: heavy tails are no second level.
 LEAST_HELD = 0.05
 # Middle and half distance of the levels (ln), scatter about them (ln), chances of a hop a sample (logit) up and down.
-BOUNDS = ((-4.0, 4.0), (-6.0, 2.0), (-6.0, 1.0), (-12.0, -1.1), (-12.0, -1.1))
+MOST_HOPS = -1.1
+BOUNDS = ((-4.0, 4.0), (-6.0, 2.0), (-6.0, 1.0), (-12.0, MOST_HOPS), (-12.0, MOST_HOPS))
+# Levels closer than so many steps of the output are those of the readout.
+FEWEST_STEPS = 2.0
+# Columns that number what was done, and the share of hops at their changes from which on the gyro does not hop.
+NUMBERS, AT_CHANGES = ("position", "segment", "run"), 0.5
 
 
 def as_cause(name: str, evidence: float, *sizes: ParameterValue) -> Cause:
@@ -44,12 +54,8 @@ def quantisation(estimate: Estimate, threshold: float) -> Cause | None:
 
     Its covariance over an even stretch is tridiagonal, and the sine transform diagonalises it.
     """
-    rows, record = estimate.record.rows, estimate.record
-    known = np.isfinite(estimate.whitened)
-    opens = np.asarray(record.sampling.restart)[:rows] | (
-        np.asarray(record.sampling.interval)[:rows] > 1.5 * record.interval
-    )
-    ends = np.flatnonzero(opens | ~known)
+    record, known = estimate.record, np.isfinite(estimate.whitened)
+    ends = np.flatnonzero((np.diff(_stretch(record), prepend=0) > 0) | ~known)
     stretches = [e[np.isfinite(e)] for e in np.split(estimate.whitened, ends)]
     stretches = [e for e in stretches if len(e) >= STRETCH]
     if not stretches:
@@ -63,6 +69,11 @@ def quantisation(estimate: Estimate, threshold: float) -> Cause | None:
     gain = -0.5 * np.log(variance).sum(1) - 0.5 * len(power) * np.log(white / power.mean())
     evidence = log_sum(gain) - np.log(len(SHARES))
     if evidence < threshold:
+        return None
+    # Many weak lines raise some frequencies; quantisation raises all of its spectrum.
+    best = int(np.argmax(gain))
+    high = int(np.sum(power > RARE_POWER * variance[best] * white[best]))
+    if stats.binom.sf(high - 1, len(power), stats.chi2.sf(RARE_POWER, 1)) < TOO_MANY:
         return None
     weight = np.exp(gain - log_sum(gain))
     unit = record.interval * np.sqrt(estimate.white_variance) / abs(float(estimate.model.gain()))
@@ -80,36 +91,43 @@ def quantisation(estimate: Estimate, threshold: float) -> Cause | None:
 def telegraph(baseline: Estimate, extended: Estimate, unit: str) -> Cause | None:
     """Hops to and fro between two levels in what the baseline leaves, where no coloured noise or steps explain it.
 
-    At a regular pace they may as well be something that switches: then the cause has half of the posterior.
+    At a regular pace they may as well be something that switches: then the cause has half of the posterior. Hops of a
+    step or two of the output, and those where a position or a segment ends, are not the gyro's.
     """
     record = baseline.record
     residual, here = baseline.residual, np.isfinite(baseline.residual)
     count = int(here.sum())
     if count < FEWEST_ROWS:
         return None
-    y = (residual[here] - residual[here].mean()) / residual[here].std()
-    restart = np.asarray(record.sampling.restart)[: record.rows][here]
+    spread = residual[here].std()
+    y = (residual[here] - residual[here].mean()) / spread
+    restart = np.diff(_stretch(record)[here], prepend=-1) != 0
 
     def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
         value, slope = _two_levels(jnp.asarray(x), y, restart)
         return -float(value), -np.asarray(slope)
 
     best = min((minimize(cost, x, jac=True, method="L-BFGS-B", bounds=BOUNDS) for x in _starts(y)), key=lambda r: r.fun)
-    upper = np.asarray(_levels(jnp.asarray(best.x), y, restart)) > 0.5
-    hops = int(np.sum(np.diff(upper) != 0))
+    _, half, sigma, up, down = best.x
+    upper = _path(best.x, y, restart)
+    changed = (np.diff(upper, prepend=upper[0]) != 0) & ~restart
+    hops = int(changed.sum())
+    size, step = 2.0 * np.exp(half) * spread, quantum(np.asarray(record.signals["output"])[: record.rows][here])
+    if hops < FEWEST_HOPS or max(up, down) > MOST_HOPS - 0.01 or (step is not None and size < FEWEST_STEPS * step):
+        return None
+    if np.mean(_change(record)[here][changed]) > AT_CHANGES:
+        return None
     # Both in nats of the same samples; every free number of each costs half of ln n.
-    other = _normal(extended, residual[here].std())
+    other = _normal(extended, spread)
     extra = len(extended.model.slots()) - len(baseline.model.slots()) + sum(float(r) > 0 for r in extended.ratios)
     lead = -best.fun - other - 0.5 * (len(best.x) - 2 - extra) * np.log(count)
-    if hops < FEWEST_HOPS or lead < HOPS_LEAD or not LEAST_HELD < upper.mean() < 1.0 - LEAST_HELD:
+    if lead < HOPS_LEAD or not LEAST_HELD < upper.mean() < 1.0 - LEAST_HELD:
         return None
-    held = np.diff(np.flatnonzero(np.diff(upper)))
+    held = np.diff(np.flatnonzero(changed))
     scatter = np.concatenate([part / part.mean() for part in (held[::2], held[1::2]) if len(part)]).std()
-    _, half, sigma, up, down = best.x
-    size = 2.0 * np.exp(half) * residual[here].std() / abs(float(baseline.model.gain()))
-    std = 2.0 * np.exp(sigma) * residual[here].std() / abs(float(baseline.model.gain())) / np.sqrt(count / 4.0)
+    std = 2.0 * np.exp(sigma) * spread / np.sqrt(count / 4.0)
     dwell = [record.interval * (1.0 + np.exp(-rate)) for rate in (up, down)]
-    scale = factor("rad/s", unit)
+    scale = factor("rad/s", unit) / abs(float(baseline.model.gain()))
     cause = as_cause(
         "noise_telegraph",
         float(lead),
@@ -120,6 +138,45 @@ def telegraph(baseline: Estimate, extended: Estimate, unit: str) -> Cause | None
         ),
     )
     return cause if scatter >= IRREGULAR else replace(cause, posterior=0.5)
+
+
+def _stretch(record: Record) -> np.ndarray:
+    """Number of the even stretch without restart or gap that each row is of."""
+    sampling = record.sampling
+    opens = np.asarray(sampling.restart) | (np.asarray(sampling.interval) > 1.5 * record.interval)
+    return np.cumsum(opens[: record.rows])
+
+
+def _change(record: Record) -> np.ndarray:
+    """Whether another position, segment or run begins at a row or beside it."""
+    changed = np.zeros(record.rows, bool)
+    for name in set(NUMBERS) & set(record.signals):
+        changed |= np.diff(np.asarray(record.signals[name])[: record.rows], prepend=np.nan) != 0
+    changed[0] = False
+    return np.convolve(changed, np.ones(3), "same") > 0
+
+
+def _path(x: np.ndarray, y: np.ndarray, restart: np.ndarray) -> np.ndarray:
+    """The likeliest sequence of levels (upper or not), by Viterbi's algorithm."""
+    each, up, down = (np.asarray(part) for part in _emissions(jnp.asarray(x), y))
+    stay_low, rise, fall, stay_high = (float(np.log(p)) for p in (1.0 - up, up, down, 1.0 - down))
+    low = high = 0.0
+    # Whether each level was best reached from the upper one.
+    back = np.zeros((len(y), 2), bool)
+    for i, (in_low, in_high) in enumerate(each.tolist()):
+        if restart[i]:
+            best = max(low, high)
+            back[i] = high > low
+            low, high = best + in_low, best + in_high
+            continue
+        back[i] = high + fall > low + stay_low, high + stay_high > low + rise
+        low, high = max(low + stay_low, high + fall) + in_low, max(high + stay_high, low + rise) + in_high
+    path = np.zeros(len(y), bool)
+    now = high > low
+    for i in range(len(y) - 1, -1, -1):
+        path[i] = now
+        now = back[i, int(now)]
+    return path
 
 
 def _starts(y: np.ndarray) -> list[np.ndarray]:
@@ -150,7 +207,7 @@ def _forward(x, y, restart):
         top = log_likelihood.max()
         joint = jnp.where(opens, still, share @ hop) * jnp.exp(log_likelihood - top)
         total = joint.sum()
-        return joint / total, (jnp.log(total) + top, joint[1] / total)
+        return joint / total, jnp.log(total) + top
 
     return jax.lax.scan(step, still, (each, restart))[1]
 
@@ -158,13 +215,7 @@ def _forward(x, y, restart):
 @jax.jit
 def _two_levels(x, y, restart):
     """Log likelihood of samples about two levels, and its derivative."""
-    return jax.value_and_grad(lambda x: _forward(x, y, restart)[0].sum())(x)
-
-
-@jax.jit
-def _levels(x, y, restart):
-    """Chance that each sample is on the upper level, seen from those before it."""
-    return _forward(x, y, restart)[1]
+    return jax.value_and_grad(lambda x: _forward(x, y, restart).sum())(x)
 
 
 def _normal(estimate: Estimate, scale: float) -> float:

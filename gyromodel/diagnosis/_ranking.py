@@ -147,9 +147,10 @@ def rank(
     # Noise beyond the statement must beat all noise within it: less than stated lacks nothing.
     within = np.array([everything[g].log_likelihood for g in families.pop("", [])])
     within_stated = max(null, log_sum(within) - np.log(len(within))) if len(within) else null
-    if estimate.noise_given and not float(estimate.ratios.flicker) and not float(estimate.ratios.markov):
-        each = _of_markov(scanner, estimate.ratios.walk, columns, residual)
-        statistic |= {"noise_markov": log_sum(each) - within_stated} if len(each) else {}
+    if estimate.noise_given and not float(estimate.ratios.flicker):
+        each, variance = _of_markov(scanner, estimate.ratios.walk, columns, residual)
+        more = variance > float(estimate.ratios.markov) * everything[cells[0]].rss
+        statistic |= {"noise_markov": log_sum(each[more]) - within_stated} if more.any() else {}
     for name, family in families.items():
         # More of it than stated, whatever the white noise turns out to be beside it.
         kind = scanner.grid.ratios.flicker if name == "noise_flicker" else scanner.grid.ratios.walk
@@ -159,24 +160,29 @@ def rank(
             statistic[name] = float(log_sum(more) - np.log(len(family)) - within_stated)
     total = log_sum(list(statistic.values())) if statistic else 0.0
     posterior = {k: float(np.exp(v - total)) for k, v in statistic.items()}
-    walk, flicker = scanner.grid.ratios.walk, scanner.grid.ratios.flicker
-    slow = {g: float(walk[g]) > 0 or float(flicker[g]) > 0 for g in cells}
-    walks = {g: float(walk[g]) > 0 for g in cells}
+    each = [scanner.grid.ratios.take(g) for g in cells]
+    slow = {g: max(float(r.walk), float(r.flicker), float(r.markov)) > 0 for g, r in zip(cells, each, strict=True)}
+    walks = {g: float(r.walk) > 0 for g, r in zip(cells, each, strict=True)}
     return Ranking(
         statistic, posterior, results, prior, slow, walks, columns, residual, scanner.degrees_of_freedom, continued
     )
 
 
-def _of_markov(scanner: Scanner, walk: Any, columns: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """Log likelihood of each cell of Markov noise beside white noise and a given walk, its prior weight in it."""
+def _of_markov(scanner: Scanner, walk: Any, columns: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cells of Markov noise beside white noise and a given walk: log likelihood with the prior, and Markov variance.
+
+    The variance is in units of the residual's sum of squares.
+    """
     grid = scanner.grid
     cells = markov_cells(scanner.degrees_of_freedom, grid.interval, grid.span)
     if not len(cells.markov):
-        return np.zeros(0)
+        return np.zeros(0), np.zeros(0)
     cells = cells._replace(walk=cells.walk + float(walk))
     data = scanner.record.sampling, jnp.asarray(columns), jnp.asarray(residual)
     result = restricted_likelihood(cells, grid.interval, grid.span, *data)
-    return result.log_likelihood + MARKOV_PRIOR - np.log(len(cells.markov))
+    return result.log_likelihood + MARKOV_PRIOR - np.log(len(cells.markov)), np.asarray(
+        cells.markov
+    ) * result.residual_sum
 
 
 def tangents(scanner: Scanner, model: GyroModel, skip: set[str]) -> dict[str, Tangent]:
@@ -222,7 +228,7 @@ def noise_kinds(scanner: Scanner, ranking: Ranking) -> dict[str, float]:
         parts = (("noise_white", True), ("noise_flicker", flicker[g] > 0), ("noise_random_walk", walk[g] > 0))
         kind = " + ".join(name for name, there in parts if there)
         logs.setdefault(kind, []).append(r.log_likelihood + ranking.log_prior[g])
-    logs["noise_white + noise_markov"] = list(_of_markov(scanner, 0.0, ranking.baseline_columns, ranking.residual))
+    logs["noise_white + noise_markov"] = list(_of_markov(scanner, 0.0, ranking.baseline_columns, ranking.residual)[0])
     total = log_sum([v for of_kind in logs.values() for v in of_kind])
     weight = {kind: float(np.exp(log_sum(v) - total)) for kind, v in logs.items() if v}
     return dict(sorted(weight.items(), key=lambda item: -item[1]))

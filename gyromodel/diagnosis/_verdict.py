@@ -191,7 +191,10 @@ def with_noise(judgement: Judgement, beyond: Sequence[Cause]) -> Judgement:
         )
     if judgement.verdict == "adequate":
         judgement = replace(judgement, verdict="named", credible_set={beyond[0].effect: 1.0})
-    return replace(judgement, causes=(*judgement.causes, *beyond))
+    causes = (*judgement.causes, *beyond)
+    if judgement.verdict == "named":
+        causes = tuple(sorted(causes, key=lambda c: -c.statistic))
+    return replace(judgement, causes=causes)
 
 
 def _close_rival(step: Found, members: dict[str, float]) -> str | None:
