@@ -387,7 +387,7 @@ def _confusion(records: list[study.Record], path: Path) -> None:
 
 def main(argv: list[str] | None = None) -> None:
     args = _arguments(argv)
-    start, controls = time.time(), find_spec("sklearn") is not None
+    start, controls = time.time(), study.CONTROLS if find_spec("sklearn") else ()
     if not controls:
         print(
             "scikit-learn is not installed: no other methods run beside (pip install gyromodel[peers])", file=sys.stderr
@@ -419,7 +419,7 @@ def main(argv: list[str] | None = None) -> None:
     unknown = {}
     for k, size in enumerate((3.0, 10.0)):
         cases = study.unknown_cases(many(UNKNOWNS), seed + 20 + k, size, FAMILY)
-        unknown[size] = run(f"unknown at {size:g} x MDE", cases, controls=controls and size == 3.0)
+        unknown[size] = run(f"unknown at {size:g} x MDE", cases, controls=controls if size == 3.0 else ())
     pairs = run("two causes", study.pair_cases(many(PAIRS), seed + 25, 3.0, FAMILY))
     inseparable = run("inseparable", study.inseparable_cases(many(INSEPARABLE), seed + 30), after=True)
     drifts = run("drifts", study.drift_cases(many(INSEPARABLE), seed + 31))

@@ -137,6 +137,27 @@ def test_units_of_the_output_change_nothing(seed: int) -> None:
     assert first.causes[0].statistic == pytest.approx(second.causes[0].statistic, abs=1e-3)
 
 
+def test_an_effect_whose_fit_fails_is_told_and_not_tried_again(monkeypatch: pytest.MonkeyPatch):
+    tried = []
+
+    def fails(record: object, baseline: object, found: list, *_: object) -> None:
+        tried.append([f.name for f in found])
+
+    monkeypatch.setattr("gyromodel.diagnosis._search.refit", fails)
+    rng = np.random.default_rng(3)
+    temperature = 20.0 + 10.0 * np.sin(np.arange(300) / 20.0)
+    output = 0.01 * temperature + 0.01 * rng.standard_normal(300)
+    campaign = gm.Campaign(
+        {"time": 10.0 * np.arange(300), "output": output, "temperature": temperature},
+        {"time": "s", "output": "deg/h", "temperature": "degC"},
+        {"kind": "rate"},
+    )
+    found = gm.diagnose(campaign, gm.model_from_effects(["bias"]), hold_out=False)
+    assert tried == [["bias_temperature"]]
+    assert found.verdict == "unknown"
+    assert any("bias_temperature is still significant" in line for line in found.findings)
+
+
 def test_diagnosing_the_extended_model_finds_nothing_more(rng: np.random.Generator) -> None:
     ramp = 8.0 * np.sin(2 * np.pi * 20.0 * np.arange(ROWS) / 4000.0)
     campaign = static_log(rng, ramp)

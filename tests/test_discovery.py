@@ -90,14 +90,6 @@ def test_uncatalogued_effects_are_unknown_and_their_driver_is_found(seed):
     _require(levels.pooled(levels.unknown_levels(records)), records, seed)
 
 
-def test_an_effect_whose_fit_fails_is_not_found_twice():
-    """A ripple in rate, no catalogue effect, for which the sine of an open loop was fitted in vain."""
-    case = study.Case(850187483245783, "rate_temperature", "random_walk", "rate_ripple", 10.0)
-    answer = study.run_case(case).answer
-    assert answer is not None
-    assert (answer.verdict, answer.driver) == ("unknown", ("rate",))
-
-
 def test_every_effect_and_uncatalogued_shape_is_in_a_campaign():
     hidden = {c.effect for c in study.effect_cases(NAMES, 0, 3.0)}
     assert hidden == {e for d in HOMES for e in TESTABLE[d]}

@@ -76,7 +76,7 @@ def test_other_noise_is_neither(kind: str, rng: np.random.Generator):
 def test_what_looks_like_a_kind_of_noise_is_not_named_so(rng: np.random.Generator):
     """Coarse readouts, many weak lines, hops at changes of a position: none of them is noise of the gyro."""
     false = 0
-    for _ in range(5):
+    for _ in range(3):
         step = rng.uniform(3.0, 6.0) * WHITE / np.sqrt(STEP)
         coarse = fitted(np.round(white(rng) / step + rng.uniform()) * step)
         false += telegraph(coarse, coarse, "rad/s") is not None
@@ -88,7 +88,7 @@ def test_what_looks_like_a_kind_of_noise_is_not_named_so(rng: np.random.Generato
         poses = log(white(rng) + 3.0 * WHITE / np.sqrt(STEP) * low).with_column("position", number, "")
         estimate = gm.fit(poses, gm.model_from_effects(["bias"]))
         false += telegraph(estimate, estimate, "rad/s") is not None
-    assert binom.sf(false - 1, 15, 0.02) > RARE
+    assert binom.sf(false - 1, 9, 0.02) > RARE
 
 
 def test_a_regular_switch_is_no_firm_noise():
@@ -98,7 +98,7 @@ def test_a_regular_switch_is_no_firm_noise():
     ends = np.cumsum(rng.normal(40, 8, 40).astype(int))
     thermostat = 2.0 * size * (np.searchsorted(ends, np.arange(ROWS), "right") % 2)
     wave = 3.0 * size * np.sign(np.sin(2 * np.pi * np.arange(ROWS) / 75))
-    for output, model in ((wave, stated()), (wave, gm.model_from_effects(["bias"])), (thermostat, stated())):
+    for output, model in ((wave, stated()), (thermostat, gm.model_from_effects(["bias"]))):
         found = gm.diagnose(log(white(rng) + output), model, hold_out=False)
         assert found.verdict == "ambiguous"
         assert set(found.credible_set) == {"noise_telegraph", "bias_periodic"}
@@ -109,12 +109,12 @@ def test_less_noise_than_stated_lacks_nothing_and_more_markov_noise_is_told(rng:
     q, constant = 4.0 * WHITE / 400.0, 400.0
     markov = gm.GyroModel(stated().effects, {"noise_white": WHITE, "noise_markov": q, "noise_markov_time": constant})
     wrong, told = 0, 0
-    for _ in range(5):
+    for _ in range(3):
         wrong += gm.diagnose(log(white(rng)), markov, hold_out=False).verdict != "adequate"
         more = white(rng) + 3.0 * truth.markov(ROWS, STEP, q, constant, rng)
         told += "noise_markov" in gm.diagnose(log(more), markov, hold_out=False).credible_set
-    assert binom.sf(wrong - 1, 5, 0.02) > RARE
-    assert binom.cdf(told, 5, 0.9) > RARE
+    assert binom.sf(wrong - 1, 3, 0.02) > RARE
+    assert binom.cdf(told, 3, 0.9) > RARE
 
 
 def test_kinds_of_noise_that_are_not_stated_are_causes():

@@ -17,6 +17,7 @@ from .campaigns import TESTABLE
 from .designs import RAMP_CODES, Design
 from .effects import error
 from .mde import Oracle, baseline
+from .memory import friction
 from .motion import BASIS, SMALL
 
 Array = np.ndarray
@@ -50,7 +51,7 @@ def _signals(name: str, design: Design) -> Array:
             shapes = [{"kind": kind, "at": at} for kind in ("parabola", "bend") for at in knots]
         case "bias_thermal_hysteresis" | "rate_hysteresis":
             driver = design.true["rate" if name == "rate_hysteresis" else "temperature"]
-            shapes = [{"half_width": part * np.ptp(driver)} for part in np.geomspace(0.03, 0.25, 10)]
+            return friction(driver, np.geomspace(0.03, 0.25, 10) * np.ptp(driver))[:, :, None]
         case "bias_readout_code":
             angle = np.pi * design.true["feedback_ramp"][:, None] / RAMP_CODES * np.arange(1, 9)
             return np.concatenate([np.sin(angle), np.cos(angle)], axis=1)[:, None]

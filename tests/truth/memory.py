@@ -38,20 +38,21 @@ def dragged(driver: Array, half_width: Array) -> Array:
     return low[:, 0] + spacing[:, 0] * total
 
 
-def _friction(driver: Array, half_width: float) -> Array:
-    """Mean force of elements that slip at ±1, each driven through its own yield."""
-    each = np.array(YIELDS) * half_width
-    return np.mean((driver[:, None] - dragged(driver, each)) / each, axis=1)
+def friction(driver: Array, half_width: float | Array) -> Array:
+    """Mean force of elements that slip at ±1, each driven through its own yield; a column for each half width."""
+    each = np.multiply.outer(np.asarray(half_width), YIELDS)
+    moved = dragged(driver, each.ravel()).reshape(len(driver), *each.shape)
+    return np.mean((driver[(slice(None), *[None] * each.ndim)] - moved) / each, axis=-1)
 
 
 def bias_thermal_hysteresis(design: Design, amplitude: float, half_width: float) -> Array:
     """Bias from parts that temperature strains until they slip."""
-    return amplitude * _friction(design.true["temperature"], half_width)
+    return amplitude * friction(design.true["temperature"], half_width)
 
 
 def rate_hysteresis(design: Design, amplitude: float, half_width: float) -> Array:
     """Error from parts that the rate drags along; the table goes straight from rate to rate."""
-    return amplitude * _friction(design.true["rate"], half_width)
+    return amplitude * friction(design.true["rate"], half_width)
 
 
 def bias_turn_on(design: Design, amplitude: float, offsets: Array) -> Array:

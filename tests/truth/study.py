@@ -144,8 +144,8 @@ def settled(built: Built, campaign: Any, model: Any, asked: str | None) -> tuple
     return tuple(gyromodel.diagnose([campaign, second], model, hold_out=False).credible_set)
 
 
-def run_case(case: Case, *, engine: bool = True, controls: bool = False, **options: Any) -> Record:
-    """Simulate, diagnose and judge one case; `options` are those of `run_engine`."""
+def run_case(case: Case, *, engine: bool = True, controls: Iterable[str] = (), **options: Any) -> Record:
+    """Simulate, diagnose and judge one case, also by some controls; `options` are those of `run_engine`."""
     built = build(case)
     truth, design = built.truth, built.design
     size, isolable, first, others = 0.0, False, "", {}
@@ -162,13 +162,14 @@ def run_case(case: Case, *, engine: bool = True, controls: bool = False, **optio
         plain = oracle(design, Noise("white", np.sqrt(design.step)), truth.baseline)  # unit variance: least squares
         unit = contest.reduced(plain, signals)
         residual = plain.reduce(data[:, None])[:, 0]
-        others = {
-            "least_squares_f": contest.least_squares_f(unit, residual, len(truth.baseline)),
-            "hac_f": contest.hac_f(unit, residual),
-            "stepwise_bic": contest.stepwise_bic(unit, residual),
-            "lasso": contest.lasso(unit, residual),
-            "boosted_trees": contest.boosted_trees(design, residual),
+        methods = {
+            "least_squares_f": lambda: contest.least_squares_f(unit, residual, len(truth.baseline)),
+            "hac_f": lambda: contest.hac_f(unit, residual),
+            "stepwise_bic": lambda: contest.stepwise_bic(unit, residual),
+            "lasso": lambda: contest.lasso(unit, residual),
+            "boosted_trees": lambda: contest.boosted_trees(design, residual),
         }
+        others = {name: methods[name]() for name in controls}
     answer = run_engine(built, **options) if engine else None
     score = judge(truth, design.name, answer, isolable or not known(case.effect)) if answer else None
     return Record(case, truth, answer, score, size, isolable, first, others)
