@@ -8,21 +8,13 @@ from __future__ import annotations
 from collections.abc import Collection
 from pathlib import Path
 
-from gyromodel.declarations import Declaration, ParameterDeclaration, declarations
-from gyromodel.noise import NOISE_UNITS
+from gyromodel.declarations import NOISE, Declaration, ParameterDeclaration, declarations
 
 PAGE = Path(__file__).with_name("effects.md")
 SITES = {
     "gain": "The gain itself",
     "scale": "Terms of the scale-factor error ε",
     "rate": "Terms added to the input rate: bias, and what drives it",
-}
-# Two-sided power spectral density of the rate, and Allan variance.
-NOISE_FORMS = {
-    "noise_white": ("N²", "N²/τ"),
-    "noise_flicker": ("B²/(2πf)", "(2 ln2/π) B²"),
-    "noise_random_walk": ("K²/(2πf)²", "K² τ/3"),
-    "noise_markov": ("(q T)²/(1 + (2πf T)²)", "peak (0.437 q)² T at 1.89 T"),
 }
 HEAD = """# The effect catalogue
 
@@ -76,11 +68,9 @@ def _meaning(parameter: ParameterDeclaration) -> str:
 
 
 def _noise() -> str:
-    rows = [[f"`{name}`", NOISE_UNITS[name], *forms] for name, forms in NOISE_FORMS.items()]
-    table = _table(["noise", "unit", "rate PSD, two-sided", "Allan variance"], rows)
-    return (
-        f"## Noise\n\n{table}\n`noise_markov` is stated with its `time_constant` T, and not beside `noise_flicker`.\n"
-    )
+    rows = [[f"`{kind.id}`", kind.unit, kind.density, kind.allan_variance, kind.meaning] for kind in NOISE.values()]
+    table = _table(["noise", "unit", "rate PSD, two-sided", "Allan variance", "meaning"], rows)
+    return f"## Noise\n\n{table}\nKinds that are not stated in model files are told of by `diagnose`.\n"
 
 
 def _table(head: list[str], rows: list[list[str]]) -> str:

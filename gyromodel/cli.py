@@ -325,13 +325,20 @@ def effects(
     """Print the catalogue of effects, or one entry in full."""
     from dataclasses import asdict
 
-    from gyromodel.declarations import declarations
+    from gyromodel.declarations import NOISE, declarations
 
     catalogue = declarations()
+    if effect in NOISE:
+        kind = asdict(NOISE[str(effect)])
+        if as_json:
+            print(json_text(kind), end="")
+        else:
+            print("\n".join(f"{name.replace('_', ' '):<15}{value}" for name, value in kind.items()))
+        return
     if effect is not None and effect not in catalogue:
         from difflib import get_close_matches
 
-        close = get_close_matches(effect, catalogue, n=3)
+        close = get_close_matches(effect, [*catalogue, *NOISE], n=3)
         hint = f"; did you mean {' or '.join(close)}?" if close else "; `gyromodel effects` lists them"
         raise typer.BadParameter(f"no effect is called {effect}{hint}", param_hint="ID")
     if as_json:
@@ -339,6 +346,7 @@ def effects(
         print(json_text(entries), end="")
     elif effect is None:
         rows = [(e.id, e.site, ", ".join(e.needs) or "–", e.equation) for e in catalogue.values()]
+        rows += [(k.id, "noise", "–", k.meaning) for k in NOISE.values()]
         print_table(("effect", "acts on", "needs", "equation"), rows)
     else:
         entry = catalogue[effect]

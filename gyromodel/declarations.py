@@ -44,6 +44,37 @@ class Declaration:
     test: str
 
 
+@dataclass(frozen=True)
+class NoiseKind:
+    """A kind of noise by its public id: unit, two-sided power spectral density of the rate, Allan variance, meaning."""
+
+    id: str
+    unit: str
+    density: str
+    allan_variance: str
+    meaning: str
+
+
+NOISE = {
+    kind.id: kind
+    for kind in (
+        NoiseKind("noise_white", "deg/sqrt(h)", "N²", "N²/τ", "angle random walk"),
+        NoiseKind("noise_flicker", "deg/h", "B²/(2πf)", "(2 ln2/π) B²", "bias instability"),
+        NoiseKind("noise_random_walk", "deg/h/sqrt(h)", "K²/(2πf)²", "K² τ/3", "rate random walk"),
+        NoiseKind(
+            "noise_markov",
+            "deg/h/sqrt(h)",
+            "(q T)²/(1 + (2πf T)²)",
+            "peak (0.437 q)² T at 1.89 T",
+            "a first-order Markov process; stated with its time_constant T, and not beside noise_flicker",
+        ),
+        NoiseKind("noise_quantisation", "arcsec", "(2πf)² Q² τ0", "3 Q²/τ²", "white noise of the angle; not stated"),
+        NoiseKind("noise_telegraph", "deg/h", "–", "–", "hops of the bias between two levels; not stated"),
+        NoiseKind("noise_heteroscedastic", "1", "–", "–", "a level that follows rate, temperature or time; not stated"),
+    )
+}
+
+
 def declarations() -> dict[str, Declaration]:
     """The catalogue by effect id, in the order of the source files."""
     classes = {}

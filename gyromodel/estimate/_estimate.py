@@ -31,7 +31,7 @@ class Estimate:
         degrees_of_freedom: samples present less free parameters.
         residual: measured minus predicted output, internal output unit; NaN where missing.
         whitened: residual whitened to unit variance; NaN where missing.
-        ratios: flicker and walk relative to the white variance.
+        ratios: flicker, walk and Markov noise relative to the white variance.
         white_variance: variance of the white noise of one sample, output unit squared.
         noise_interval: 95 % interval of each noise coefficient, internal rate units.
         log_likelihood: restricted, at the estimate.

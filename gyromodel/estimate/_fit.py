@@ -100,7 +100,8 @@ def fit_record(
         record: the data.
         model: what to fit.
         ratios: noise ratios to hold instead of estimating them.
-        markov: whether the noise beside white is a Markov process, or flicker and walk; none: the likelier.
+        markov: whether the noise beside white is a Markov process, or flicker and walk; none: these, unless a Markov
+            process is likelier by a margin.
         solver: see `fit`.
         ordinary: weigh all samples alike in the parameters (the noise is still estimated, and so is the covariance that
             ordinary least squares has under it): less efficient where the noise model is right, safer where it is not.

@@ -16,7 +16,7 @@ from gyromodel._checks import usual_unit
 from gyromodel.effects.drivers import BiasColumn
 from gyromodel.estimate import Calibration, validity_unit
 from gyromodel.model_files import SETTING_UNITS, parameter_names
-from gyromodel.noise import NOISE_UNITS
+from gyromodel.noise import MARKOV_TIME, NOISE_UNITS
 from gyromodel.units import factor, from_internal, internal_unit
 
 FORMULA = (
@@ -74,10 +74,12 @@ def column_unit(effect: BiasColumn) -> str:
 
 
 def _noise(calibration: Calibration) -> list[Entry]:
-    return [
-        Entry(name, "noise", "value", float(from_internal(x, NOISE_UNITS[name])), math.nan, NOISE_UNITS[name], float(x))
-        for name, x in calibration.model.noise.items()
-    ]
+    found = []
+    for name, x in calibration.model.noise.items():
+        effect, what = ("noise_markov", "time_constant") if name == MARKOV_TIME else (name, "value")
+        unit = NOISE_UNITS[name]
+        found.append(Entry(effect, "noise", what, float(from_internal(x, unit)), math.nan, unit, float(x)))
+    return found
 
 
 def validity(calibration: Calibration) -> dict[str, tuple[float, float, str]]:
@@ -127,7 +129,7 @@ def as_json(calibration: Calibration) -> str:
         "gyro": model.gyro,
         "formula": FORMULA,
         "effects": effects,
-        "noise": [{"effect": e.effect, "value": e.value, "unit": e.unit} for e in _noise(calibration)],
+        "noise": [{"effect": e.effect, "name": e.name, "value": e.value, "unit": e.unit} for e in _noise(calibration)],
         "validity": {
             name: {"lowest": low, "highest": high, "unit": unit}
             for name, (low, high, unit) in validity(calibration).items()

@@ -13,17 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from gyromodel.declarations import NOISE
 from gyromodel.numerics.state_space import MarkovSum
 
 MARKOV_TIME = "noise_markov_time"
 # What a model can state of its noise, by public id, and the units it is written in.
 NOISE_UNITS = {
-    "noise_white": "deg/sqrt(h)",
-    "noise_flicker": "deg/h",
-    "noise_random_walk": "deg/h/sqrt(h)",
-    "noise_markov": "deg/h/sqrt(h)",
-    MARKOV_TIME: "s",
-}
+    name: NOISE[name].unit for name in ("noise_white", "noise_flicker", "noise_random_walk", "noise_markov")
+} | {MARKOV_TIME: "s"}
 
 # Up to this many samples (averaged test points, say) noise is taken as white: they cannot show its colour.
 FEWEST_FOR_COLOUR = 40
