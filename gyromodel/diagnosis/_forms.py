@@ -11,7 +11,8 @@ from jaxtyping import Array, Float
 from gyromodel.diagnosis._evidence import log_evidence_ratio
 from gyromodel.diagnosis._lines import RESOLVED
 from gyromodel.diagnosis._ranking import Ranking, is_noise, line_frequencies
-from gyromodel.diagnosis._scan import Scanner, Tangent
+from gyromodel.diagnosis._scan import Scanner
+from gyromodel.diagnosis._tangents import Tangent
 from gyromodel.effects import Effect
 from gyromodel.effects.drivers import BiasPeriodic, BiasStep
 from gyromodel.estimate import Estimate

@@ -11,7 +11,8 @@ import numpy as np
 
 from gyromodel._checks import thermometers
 from gyromodel.diagnosis._evidence import log_sum
-from gyromodel.diagnosis._scan import CellResult, Scanner, Tangent
+from gyromodel.diagnosis._scan import CellResult, Scanner
+from gyromodel.diagnosis._tangents import Tangent
 from gyromodel.effects import CATALOGUE
 from gyromodel.effects._base import evaluate
 from gyromodel.effects.drivers import BiasColumn, BiasPeriodic

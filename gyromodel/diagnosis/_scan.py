@@ -12,7 +12,6 @@ from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass
 from functools import cache
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,12 +23,10 @@ from gyromodel.diagnosis._cells import Cell, Cells, precision
 from gyromodel.diagnosis._evidence import log_evidence_ratio, log_mean, log_mean_of_parts
 from gyromodel.diagnosis._lines import PEAK_WIDTH, PEAKS, line_grid
 from gyromodel.diagnosis._points import explained_by, robust_order
-from gyromodel.effects import Effect
+from gyromodel.diagnosis._tangents import VANISHED, Tangent, add_tangents
 from gyromodel.noise import NoiseGrid
 from gyromodel.signals import Record
 
-# A candidate whose columns keep less than this share of their energy beside the baseline cannot be tested.
-VANISHED = 1e-6
 THREADS = 2
 # Lines whose interpolated statistic, were it this much larger, would not pay for the search are left interpolated.
 PEAK_SLACK = 1.5
@@ -77,38 +74,6 @@ class Batch:
         }
         evidence = {name: float(v[0]) for name, v in self.evidence.items()}
         return CellResult(float(self.log_likelihood[0]), float(self.rss[0]), evidence, best, self.energy, self.peaks)
-
-
-class Tangent(NamedTuple):
-    """A candidate that continues effects of the baseline: its derivative by its amplitude there."""
-
-    effect: Effect
-    column: np.ndarray
-
-
-def _tangents(batch: Batch, tangents: Sequence[Tangent], x: np.ndarray, z: np.ndarray, p: int, nu: int) -> None:
-    """Evidence of the candidates whose columns stand first in x, before p of the baseline and the residuals."""
-    first = len(tangents)
-    if not first:
-        return
-    left = x[:, : first + p].T @ z
-    # In columns of length one: of a long and a short column of the baseline, neither may be left unprojected.
-    length = np.sqrt(np.maximum(np.diag(left[first:, first : first + p]), 1e-300))
-    left[first:] /= length[:, None]
-    left[:, first : first + p] /= length
-    own, cross, data = left[:first, :first], left[:first, first : first + p], left[:, first + p :]
-    inner = np.linalg.lstsq(left[first:, first : first + p], np.column_stack([cross.T, data[first:]]), rcond=1e-13)[0]
-    energy = np.diag(own - cross @ inner[:, :first])
-    along = data[:first] - cross @ inner[:, first:]
-    for tangent, size, norm, b in zip(tangents, energy, np.diag(own), along, strict=True):
-        name = tangent.effect.id
-        batch.energy[name] = np.array([size if size > VANISHED * norm else 0.0])
-        if size > VANISHED * norm:
-            # What the amplitude explains that is best within the effect's reach.
-            best = np.clip(b / size, -tangent.effect.reach, tangent.effect.reach)
-            t = np.minimum(2.0 * best * b - best**2 * size, batch.rss)
-            batch.evidence[name] = log_evidence_ratio(t, batch.rss, nu, 1)
-            batch.best[name] = ([0] * len(t), t, np.ones(len(t)))
 
 
 class Scanner:
@@ -235,7 +200,7 @@ class Scanner:
             for i, g in enumerate(group):
                 x, zi = stacked[:, first:], z[i][:, first:]
                 batches.append(batch := self._run_cell(g, x, zi, cross[i][:, first:], p, least, barred))
-                _tangents(batch, tangents, stacked, z[i], p, self.degrees_of_freedom - p)
+                add_tangents(batch, tangents, stacked, z[i], p, self.degrees_of_freedom - p)
             return batches
 
         # Cells share the cores; BLAS threads on top of them would only wait for one another.
