@@ -184,7 +184,9 @@ def diagnose(
             "angle); fits take it as white noise of the rate."
         )
     # Where the simulation leaves its noise to be estimated, its kinds are no discrepancy, but for what no fit holds.
-    judgement = with_noise(judgement, beyond if baseline.noise_given else [c for c in beyond if c is hops])
+    judgement = with_noise(
+        judgement, beyond if baseline.noise_given else [c for c in beyond if c is hops], len(bank.names())
+    )
     next_test = judgement.next_test
     if judgement.verdict == "ambiguous":
         searched = [c for c, _ in shortened]

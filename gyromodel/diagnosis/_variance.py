@@ -17,6 +17,8 @@ SIGNIFICANT = 1e-5
 HEAVY = 6.0
 # Two-sided significance at which a stated noise level is contradicted.
 CONTRADICTED = 1e-4
+# Sample intervals that differ by this factor are of different kinds.
+CHANGED = 1.2
 # Steps of the output are said of where each level comes so often, or from this part of the output's scatter on.
 OFTEN, COARSE = 50, 0.5
 
@@ -35,6 +37,11 @@ def variance_drivers(record: Record) -> dict[str, np.ndarray]:
             inside = values[: record.rows]
             if np.isfinite(inside).all() and np.ptp(inside) > 0:
                 found[label] = (values - inside.min()) / np.ptp(inside)
+    interval = np.asarray(record.sampling.interval)
+    low, high = np.quantile(interval[: record.rows], [0.05, 0.95])
+    if high > CHANGED * low:
+        # Means over another time have another scatter. Gaps are no interval.
+        found["sample interval"] = (np.clip(interval, low, high) - low) / (high - low)
     return found
 
 

@@ -171,10 +171,11 @@ def judge(
     return Judgement("ambiguous", (*doubtful, *firm), sets[0], None, test, unexplained, tuple(findings))
 
 
-def with_noise(judgement: Judgement, beyond: Sequence[Cause]) -> Judgement:
+def with_noise(judgement: Judgement, beyond: Sequence[Cause], trials: int) -> Judgement:
     """The judgement with kinds of noise that the simulation lacks beside what else it lacks."""
     if not beyond:
         return judgement
+    beyond = [replace(c, p_adjusted=min(1.0, c.p_value * trials)) for c in beyond]
     regular = [c for c in beyond if c.posterior < 1.0]
     if regular:
         # Hops at a regular pace, which something that switches makes as well.
