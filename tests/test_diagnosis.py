@@ -268,7 +268,7 @@ def test_line_energies_are_the_whitened_ones(rng: np.random.Generator) -> None:
     assert scanner.lines is not None
     waves = scanner.lines.waves(np.arange(len(scanner.lines.frequencies)))
     for g in range(3):
-        cosine, sine = np.split(scanner.cells.whiten(g, jnp.asarray(waves)), 2, axis=1)
+        cosine, sine = np.split(scanner.cells.whiten(g, waves), 2, axis=1)
         found = scanner.cells[g].line
         assert found[:, 0, 0] == pytest.approx(np.sum(cosine**2, axis=0), rel=0.1)
         assert found[:, 1, 1] == pytest.approx(np.sum(sine**2, axis=0), rel=0.1)

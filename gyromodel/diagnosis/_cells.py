@@ -115,7 +115,7 @@ class Cells:
         log_determinant = np.asarray(filter.log_determinant)
         made = []
         for i in range(len(cells)):
-            own = filter._replace(gain=jnp.asarray(gain[..., i]), scale=jnp.asarray(scale[..., i]))
+            own = filter._replace(gain=gain[..., i].copy(), scale=scale[..., i].copy())
             made.append(Cell(own, float(log_determinant[i]), {}, step[:, i].copy(), pulse[:, i].copy(), NO_LINES))
         return made
 
@@ -142,9 +142,9 @@ class Cells:
         line = self._lines.energies(pairs[:, 0, 0], pairs[:, 1, 1], pairs[:, 0, 1]) if self._lines else NO_LINES
         return replace(cell, blocks=blocks, line=line)
 
-    def whiten(self, g: int, columns: jax.Array) -> np.ndarray:
+    def whiten(self, g: int, columns: np.ndarray) -> np.ndarray:
         """Columns whitened in one noise cell."""
-        padded = jnp.pad(columns, ((0, 0), (0, -columns.shape[1] % COLUMN_STEP)))
+        padded = np.pad(columns, ((0, 0), (0, -columns.shape[1] % COLUMN_STEP)))
         return np.asarray(whiten_columns(self[g].filter, padded))[:, : columns.shape[1]]
 
     def groups(self, cells: Sequence[int], columns: int) -> list[Sequence[int]]:

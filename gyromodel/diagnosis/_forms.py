@@ -93,22 +93,22 @@ def _solved(scanner: Scanner, estimate: Estimate, effect: Effect, g: int, pulses
 
 def _grown(scanner: Scanner, estimate: Estimate, tangent: Tangent, g: int, pulses: tuple[int, ...]) -> Effect:
     """An effect that continues others, at the amplitude that fits best beside them."""
-    effect, column = tangent.effect, jnp.asarray(tangent.column)[:, None] * estimate.model.gain()
+    effect, column = tangent.effect, tangent.column[:, None] * float(estimate.model.gain())
     best = _coefficients(scanner, estimate.model, column, g, pulses)
     name = [k for k, declared in effect.declared().items() if not declared.linear][-1]
     return replace(effect, **{name: jnp.clip(best[0], -effect.reach, effect.reach)})
 
 
 def _coefficients(
-    scanner: Scanner, model: GyroModel, columns: Array, g: int, pulses: tuple[int, ...]
+    scanner: Scanner, model: GyroModel, columns: Array | np.ndarray, g: int, pulses: tuple[int, ...]
 ) -> Float[Array, " coefficient"]:
     """The coefficients of columns that fit best beside a model, in one noise cell."""
     record = scanner.record
     predicted, jacobian = model.linearise(record.signals)
-    residual = jnp.where(record.sampling.present, record.signals["output"] - predicted, 0.0)
-    marks = jnp.zeros((len(residual), len(pulses))).at[jnp.asarray(pulses, int), jnp.arange(len(pulses))].set(1.0)
-    stacked = jnp.column_stack([jacobian, marks, columns, residual])
-    w = np.asarray(scanner.cells.whiten(g, stacked))[:, : stacked.shape[1]]
+    residual = np.where(scanner.present, np.asarray(record.signals["output"]) - predicted, 0.0)
+    marks = np.zeros((len(residual), len(pulses)))
+    marks[list(pulses), np.arange(len(pulses))] = 1.0
+    w = scanner.cells.whiten(g, np.column_stack([jacobian, marks, columns, residual]))
     norm = np.linalg.norm(w[:, :-1], axis=0)
     norm[norm == 0] = 1.0
     solution = np.linalg.lstsq(w[:, :-1] / norm, w[:, -1], rcond=1e-9)[0] / norm

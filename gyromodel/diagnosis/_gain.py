@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
@@ -56,7 +55,7 @@ def held_out(record: Record, train: Estimate, rows: np.ndarray) -> tuple[np.ndar
 def _log_density(record: Record, residual: np.ndarray, estimate: Estimate) -> float:
     filter = filter_of(record, estimate.ratios)
     present = np.asarray(record.sampling.present)
-    w = np.asarray(whiten_columns(filter, jnp.asarray(np.where(present, residual, 0.0))[:, None]))[:, 0]
+    w = np.asarray(whiten_columns(filter, np.where(present, residual, 0.0)[:, None]))[:, 0]
     variance = estimate.white_variance
     return float(
         -0.5 * np.sum(w**2) / variance

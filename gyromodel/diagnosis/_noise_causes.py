@@ -102,9 +102,12 @@ def telegraph(baseline: Estimate, extended: Estimate, unit: str) -> Cause | None
     spread = residual[here].std()
     y = (residual[here] - residual[here].mean()) / spread
     restart = np.diff(_stretch(record)[here], prepend=-1) != 0
+    # Of a length that recurs; samples behind the last one count for nothing.
+    samples = np.pad(y, (0, len(record.sampling.present) - count), constant_values=np.nan)
+    opens = np.resize(restart, len(samples))
 
     def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
-        value, slope = _two_levels(jnp.asarray(x), y, restart)
+        value, slope = _two_levels(x, samples, opens)
         return -float(value), -np.asarray(slope)
 
     best = min((minimize(cost, x, jac=True, method="L-BFGS-B", bounds=BOUNDS) for x in _starts(y)), key=lambda r: r.fun)
@@ -158,8 +161,9 @@ def _change(record: Record) -> np.ndarray:
 
 def _path(x: np.ndarray, y: np.ndarray, restart: np.ndarray) -> np.ndarray:
     """The likeliest sequence of levels (upper or not), by Viterbi's algorithm."""
-    each, up, down = (np.asarray(part) for part in _emissions(jnp.asarray(x), y))
-    stay_low, rise, fall, stay_high = (float(np.log(p)) for p in (1.0 - up, up, down, 1.0 - down))
+    middle, half, sigma, up, down = x
+    each = -0.5 * np.square((y[:, None] - middle - np.array([-1.0, 1.0]) * np.exp(half)) / np.exp(sigma))
+    stay_low, rise, fall, stay_high = (-float(np.log1p(np.exp(v))) for v in (up, -up, -down, down))
     low = high = 0.0
     # Whether each level was best reached from the upper one.
     back = np.zeros((len(y), 2), bool)
@@ -192,9 +196,10 @@ def _starts(y: np.ndarray) -> list[np.ndarray]:
 def _emissions(x, y):
     """Log likelihood of each sample in each level, and chances of a hop up and down."""
     levels = x[0] + jnp.array([-1.0, 1.0]) * jnp.exp(x[1])
-    scatter = jnp.exp(x[2])
-    each = -0.5 * ((y[:, None] - levels) / scatter) ** 2 - jnp.log(scatter) - 0.5 * jnp.log(2.0 * jnp.pi)
-    return each, jax.nn.sigmoid(x[3]), jax.nn.sigmoid(x[4])
+    known = jnp.isfinite(y)
+    off = (jnp.where(known, y, 0.0)[:, None] - levels) / jnp.exp(x[2])
+    each = -0.5 * off**2 - x[2] - 0.5 * jnp.log(2.0 * jnp.pi)
+    return jnp.where(known[:, None], each, 0.0), jax.nn.sigmoid(x[3]), jax.nn.sigmoid(x[4])
 
 
 def _forward(x, y, restart):

@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from gyromodel._checks import thermometers
@@ -179,8 +178,7 @@ def _of_markov(scanner: Scanner, walk: Any, columns: np.ndarray, residual: np.nd
     if not len(cells.markov):
         return np.zeros(0), np.zeros(0)
     cells = cells._replace(walk=cells.walk + float(walk))
-    data = scanner.record.sampling, jnp.asarray(columns), jnp.asarray(residual)
-    result = restricted_likelihood(cells, grid.interval, grid.span, *data)
+    result = restricted_likelihood(cells, grid.interval, grid.span, scanner.record.sampling, columns, residual)
     return result.log_likelihood + MARKOV_PRIOR - np.log(len(cells.markov)), np.asarray(
         cells.markov
     ) * result.residual_sum

@@ -334,7 +334,7 @@ class Scanner:
         if not len(peaks):
             return {}
         waves = self.lines.waves(np.resize(peaks, PEAKS))
-        w = self.cells.whiten(g, jnp.asarray(waves))
+        w = self.cells.whiten(g, waves)
         pair = w.reshape(len(w), 2, PEAKS)[:, :, : len(peaks)]
         own = np.einsum("nik,njk->kij", pair, pair)
         cross = np.stack([c[peaks], s[peaks]], axis=1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import numpy as np
 
 from gyromodel.diagnosis._bank import PART_OF
@@ -45,7 +44,7 @@ def separation(scanner: Scanner, ranking: Ranking, a: str, b: str) -> float | No
     if first is None or second is None:
         return None
     g = ranking.best_cell(a)
-    w = scanner.cells.whiten(g, jnp.asarray(np.concatenate([ranking.baseline_columns, first, second], axis=1)))
+    w = scanner.cells.whiten(g, np.concatenate([ranking.baseline_columns, first, second], axis=1))
     p = ranking.baseline_columns.shape[1]
     base = w[:, :p] / np.maximum(np.linalg.norm(w[:, :p], axis=0), 1e-300)
     rest = w[:, p:] - base @ np.linalg.lstsq(base, w[:, p:], rcond=1e-10)[0]
@@ -74,13 +73,13 @@ def remaining(scanner: Scanner, baseline: Estimate, selection: Selection) -> tup
     for estimate in (baseline, selection.estimate):
         predicted, jacobian = estimate.model.linearise(record.signals)
         gain = float(estimate.model.gain())
-        y = jnp.where(record.sampling.present, record.signals["output"] - predicted, 0.0) / gain
+        y = np.where(scanner.present, np.asarray(record.signals["output"]) - predicted, 0.0) / gain
         marks = np.zeros((len(scanner.present), 0))
         rows = [r for f in selection.found for r in f.rows]
         if rows:
             marks = np.zeros((len(scanner.present), len(rows)))
             marks[rows, np.arange(len(rows))] = 1.0
-        w = scanner.cells.whiten(g, jnp.column_stack([jacobian, jnp.asarray(marks), y]))
+        w = scanner.cells.whiten(g, np.column_stack([jacobian, marks, y]))
         base = w[:, :-1] / np.maximum(np.linalg.norm(w[:, :-1], axis=0), 1e-300)
         residuals.append(float(np.sum((w[:, -1] - base @ np.linalg.lstsq(base, w[:, -1], rcond=1e-10)[0]) ** 2)))
     named = max(residuals[0] - residuals[1], 0.0)
@@ -95,9 +94,9 @@ def driver_shape(scanner: Scanner, selection: Selection, name: str, unit: str) -
     record, estimate = scanner.record, selection.estimate
     predicted, jacobian = estimate.model.linearise(record.signals)
     gain = float(estimate.model.gain())
-    y = jnp.where(record.sampling.present, record.signals["output"] - predicted, 0.0) / gain
+    y = np.where(scanner.present, np.asarray(record.signals["output"]) - predicted, 0.0) / gain
     g = ranking.best_cell(name)
-    w = scanner.cells.whiten(g, jnp.column_stack([jacobian / gain, jnp.asarray(columns), y]))
+    w = scanner.cells.whiten(g, np.column_stack([jacobian / gain, columns, y]))
     p = jacobian.shape[1]
     norm = np.maximum(np.linalg.norm(w[:, :-1], axis=0), 1e-300)
     u, s, vt = np.linalg.svd(w[:, :-1] / norm, full_matrices=False)

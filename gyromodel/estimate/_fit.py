@@ -166,7 +166,7 @@ def make_filter(ratios: NoiseRatios, interval, longest, sampling) -> Filter:
 
 def filter_of(record: Record, ratios: NoiseRatios) -> Filter:
     """The whitening filter of one noise cell on a record."""
-    ratios = NoiseRatios(*(jnp.asarray(r) for r in ratios))
+    ratios = NoiseRatios(*(np.asarray(r, float) for r in ratios))
     return make_filter(ratios, record.interval, float(ratios.longest(record_span(record))), record.sampling)
 
 
@@ -210,7 +210,7 @@ def best_ratios(
     It is flicker and walk, unless a Markov process beside white noise is likelier by a margin.
     """
     predicted, jacobian = model.linearise(record.signals)
-    residual = jnp.where(record.sampling.present, record.signals["output"] - predicted, 0.0)
+    residual = np.where(record.sampling.present, np.asarray(record.signals["output"]) - predicted, 0.0)
     span = record_span(record)
 
     def likelihood(cells: NoiseRatios) -> np.ndarray:
@@ -281,9 +281,9 @@ def _finish(
     ordinary = variance is not None
     predicted, jacobian = model.linearise(record.signals)
     output, present = record.signals["output"], record.sampling.present
-    residual = jnp.where(present, output - predicted, 0.0)
+    residual = np.where(present, np.asarray(output) - predicted, 0.0)
     p = jacobian.shape[1]
-    w = np.asarray(whiten_columns(filter, pad_columns(jnp.column_stack([jacobian, residual]))))[
+    w = np.asarray(whiten_columns(filter, pad_columns(np.column_stack([jacobian, residual]))))[
         np.asarray(present), : p + 1
     ]
     covariance = unit_covariance(w[:, :p], model)
@@ -342,8 +342,9 @@ def unit_covariance(whitened_jacobian: np.ndarray, model: GyroModel) -> np.ndarr
 
 def _ordinary_covariance(record: Record, filter: Filter, jacobian, model: GyroModel) -> np.ndarray:
     """(JᵀWJ)⁻¹ JᵀWVWJ (JᵀWJ)⁻¹ for weights W = 1/white, in units of the white variance."""
-    weighted = jnp.where(record.sampling.present[:, None], jacobian / record.sampling.white[:, None], 0.0)
-    root = jnp.where(record.sampling.present[:, None], jacobian / jnp.sqrt(record.sampling.white)[:, None], 0.0)
+    present, white = (np.asarray(part)[:, None] for part in (record.sampling.present, record.sampling.white))
+    weighted = np.where(present, jacobian / white, 0.0)
+    root = np.where(present, jacobian / np.sqrt(white), 0.0)
     bread = unit_covariance(np.asarray(root), model)
     meat = np.asarray(_coloured_transposed(filter, weighted))
     return bread @ (meat.T @ meat) @ bread
@@ -366,7 +367,7 @@ def with_noise_intervals(estimate: Estimate) -> Estimate:
         return estimate
     record, gain = estimate.record, float(estimate.model.gain())
     predicted, jacobian = estimate.model.linearise(record.signals)
-    residual = jnp.where(record.sampling.present, record.signals["output"] - predicted, 0.0)
+    residual = np.where(record.sampling.present, np.asarray(record.signals["output"]) - predicted, 0.0)
     span = record_span(record)
     samples = int(record.present.sum())
     grid = noise_grid(samples, record.interval, span).ratios

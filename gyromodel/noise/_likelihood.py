@@ -34,11 +34,15 @@ def _grams(ratios: NoiseRatios, interval, longest, sampling: Sampling, columns):
 
 
 def gram_by_cell(
-    ratios: NoiseRatios, interval: float, span: float, sampling: Sampling, columns: Float[Array, "sample column"]
+    ratios: NoiseRatios,
+    interval: float,
+    span: float,
+    sampling: Sampling,
+    columns: Float[Array | np.ndarray, "sample column"],
 ) -> tuple[np.ndarray, np.ndarray]:
     """ln |V| and Xᵀ V⁻¹ X of every cell, cells in groups of a fixed size and columns padded, so that shapes recur."""
     width = -(-columns.shape[1] // COLUMN_STEP) * COLUMN_STEP
-    padded = jnp.pad(columns, ((0, 0), (0, width - columns.shape[1])))
+    padded = np.pad(np.asarray(columns), ((0, 0), (0, width - columns.shape[1])))
     cells = len(ratios.flicker)
     longest = np.broadcast_to(ratios.longest(span), cells)
     parts = []
@@ -70,7 +74,7 @@ def restricted_likelihood(
     residual: Float[Array | np.ndarray, " sample"],
 ) -> CellFit:
     """−½ ln|V| − ½ ln|JᵀV⁻¹J| − (ν/2) ln RSS of every cell."""
-    log_determinant, gram = gram_by_cell(ratios, interval, span, sampling, jnp.column_stack([jacobian, residual]))
+    log_determinant, gram = gram_by_cell(ratios, interval, span, sampling, np.column_stack([jacobian, residual]))
     return from_grams(log_determinant, gram, int(np.asarray(sampling.present).sum()))
 
 

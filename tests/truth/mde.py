@@ -71,7 +71,7 @@ def target(effect: str) -> float:
 
 
 def amplitude(effect: str, design: Design, noise: Noise, shape: dict[str, Any], times_mde: float) -> float:
-    """Amplitude that puts an effect at `times_mde` times its minimal detectable size."""
+    """Amplitude that puts an effect at `times_mde` times its minimal detectable size, or as near as it can be."""
     judge = oracle(design, noise, baseline(design, effect) + simpler(effect))
     wanted = times_mde * target(effect)
     brackets = BRACKETS
@@ -83,6 +83,9 @@ def amplitude(effect: str, design: Design, noise: Noise, shape: dict[str, Any], 
         def excess(log_size: float) -> float:
             return judge.norm(error(effect, design, np.exp(log_size), shape)) - wanted
 
-        return float(np.exp(root_scalar(excess, bracket=np.log(brackets[effect])).root))
+        low, high = np.log(brackets[effect])
+        if excess(high) < 0:
+            return float(np.exp(high))  # as large as it can be
+        return float(np.exp(root_scalar(excess, bracket=(low, high)).root))
     small = SMALL.get(effect, 1.0)
     return wanted * small / judge.norm(error(effect, design, small, shape))
