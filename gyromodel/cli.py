@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from io import TextIOWrapper
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -24,13 +24,12 @@ from gyromodel._console import (
     refusal,
     refuse_overwriting,
 )
+from gyromodel._diagnose_files import REPORTS, diagnose_axes, diagnose_to
 
 if TYPE_CHECKING:
-    from gyromodel.campaign import Campaign
-    from gyromodel.diagnosis import Diagnosis
+    pass
 
 DATA = Path(__file__).parent / "data"
-REPORTS = ("report.html", "diagnosis.json", "model.yaml")
 # Help without rich: it loads in half the time.
 app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -104,7 +103,7 @@ def demo(as_json: AsJson = False) -> None:
     }
     found = {}
     for folder, title in titles.items():
-        diagnosis, verdict = _diagnose(
+        diagnosis, verdict = diagnose_to(
             read_campaigns([folder / "campaign.csv"], None), folder / "simulation.yaml", folder
         )
         found["ring_laser" if folder is table else "fiber_optic"] = diagnosis.to_dict() | {"model": "model.yaml"}
@@ -166,9 +165,9 @@ def diagnose(
         raise typer.BadParameter("200 campaigns or more show a 99 % point; 0 takes the safe threshold", param_hint="N")
     measured = read_campaigns(campaigns, axis)
     if len(measured[0].outputs) > 1:
-        result, verdict, written = _diagnose_axes(measured, model, output, calibrate, seed)
+        result, verdict, written = diagnose_axes(measured, model, output, calibrate, seed)
     else:
-        diagnosis, verdict = _diagnose(measured, model, output, calibrate=calibrate, seed=seed)
+        diagnosis, verdict = diagnose_to(measured, model, output, calibrate=calibrate, seed=seed)
         result, written = diagnosis.to_dict() | {"model": "model.yaml"}, REPORTS
     if as_json:
         print(json_text(result), end="")
@@ -355,56 +354,3 @@ def effects(
         print(f"\nacts on  {entry.site}\nneeds    {needs}\ncause    {entry.cause}\ntest     {entry.test}\n")
         rows = [(p.name, f"{p.typical:g}", p.unit, p.meaning) for p in entry.parameters]
         print_table(("parameter", "typical", "unit", "meaning"), rows)
-
-
-def _diagnose_axes(
-    measured: Sequence[Campaign], model: Path, output: Path, calibrate: int, seed: int
-) -> tuple[dict[str, Any], str, tuple[str, ...]]:
-    """Diagnose each axis that can be, and how the axes lie together; the answer, its words, the files."""
-    from gyromodel._checks import CampaignError
-    from gyromodel.estimate import EstimateError
-    from gyromodel.model import ModelError
-    from gyromodel.three_axes import triad
-
-    axes, not_diagnosed, said, written, extended = {}, {}, [], [], {}
-    for name in measured[0].outputs:
-        axis = name.removeprefix("output_")
-        dead = [reason for c in measured if name in c.columns and (reason := c.dead(name))]
-        try:
-            if not dead:
-                alone = [campaign.axis(axis) for campaign in measured]
-                diagnosis, verdict = _diagnose(alone, model, output / axis, calibrate=calibrate, seed=seed)
-        except (EstimateError, ModelError) as error:
-            dead = [str(error)]
-        if dead:
-            not_diagnosed[axis] = dead[0]
-            continue
-        axes[axis], extended[axis] = diagnosis.to_dict() | {"model": f"{axis}/model.yaml"}, diagnosis.extended
-        said.append(f"Axis {axis}: {verdict}")
-        written += [f"{axis}/{report}" for report in REPORTS]
-    if not axes:
-        raise CampaignError(f"no axis can be diagnosed; {'; '.join(f'{a}: {why}' for a, why in not_diagnosed.items())}")
-    for axis, reason in not_diagnosed.items():
-        print(f"gyromodel: axis {axis} was not diagnosed: {reason}", file=sys.stderr)
-    lie = triad(measured, extended)
-    result = {"axes": axes, "not_diagnosed": not_diagnosed, "triad": lie and lie.to_dict()}
-    write_text(output / "axes.json", json_text(result))
-    return result, "\n".join([*said, *([lie.sentence()] if lie else [])]), (*written, "axes.json")
-
-
-def _diagnose(
-    measured: Sequence[Campaign], model: Path, output: Path, *, calibrate: int = 0, seed: int = 0
-) -> tuple[Diagnosis, str]:
-    """Diagnose one axis and write the results; and the verdict in a sentence."""
-    prepare_folder(output, model)
-    from gyromodel.diagnosis import diagnose as diagnose_campaigns
-    from gyromodel.model_files import read_model, write_model
-    from gyromodel.report import sentence, write_report
-
-    start = read_model(model)
-    with progress_bar() as progress:
-        diagnosis: Diagnosis = diagnose_campaigns(measured, start, calibrate=calibrate, seed=seed, progress=progress)
-    write_model(diagnosis.extended, output / "model.yaml")
-    write_text(output / "diagnosis.json", json_text(diagnosis.to_dict() | {"model": "model.yaml"}))
-    write_report(diagnosis, output)
-    return diagnosis, sentence(diagnosis)

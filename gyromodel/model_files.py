@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import re
-from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
-from yaml.reader import ReaderError
 
 from gyromodel import __version__
 from gyromodel._atomic import write_text
 from gyromodel._checks import thermometers
+from gyromodel._yaml import Place, complaint, compose, exact_text
 from gyromodel.effects import Effect
 from gyromodel.effects.drivers import BiasColumn
 from gyromodel.estimate import Calibration, Estimate, validity_unit
@@ -21,7 +20,7 @@ from gyromodel.model import GyroModel, ModelError, make_effect, parameter_unit
 from gyromodel.noise import MARKOV_TIME, NOISE_UNITS, check_stated
 from gyromodel.numerics.uncertain import Uncertain
 from gyromodel.signals import Record
-from gyromodel.units import UnitError, convertible, factor, from_internal, internal_unit, quantity, to_internal
+from gyromodel.units import from_internal, internal_unit
 
 # Written into fitted models; `read_calibration` reads them, and no other use of the model needs them.
 RECORD_KEYS = ("fit", "software")
@@ -29,81 +28,6 @@ RECORD_KEYS = ("fit", "software")
 GAIN_UNITS = ("count/deg", "count/(deg/s)", "bit/deg", "bit/(deg/s)", "V/(deg/s)", "V/deg", "A/(deg/s)", "1/deg", "")
 FIT_KEYS = ("degrees_of_freedom", "validity", "data_hash", "covariance")
 SETTING_UNITS = {"reference": "degC", "full_rate": "deg/s", "lowest": "deg/s"}
-
-
-_NUMBER = re.compile(r"\s*[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?")
-
-
-class _Place:
-    """A piece of the file with its line, so that every complaint says where."""
-
-    def __init__(self, path: Path, node: yaml.Node) -> None:
-        self.path, self.node = path, node
-
-    def error(self, message: str) -> ModelError:
-        return _complaint(self.path, self.node.start_mark.line, message)
-
-    def mapping(self, allowed: tuple[str, ...], what: str, *, complete: bool = False) -> dict[str, _Place]:
-        if not isinstance(self.node, yaml.MappingNode):
-            raise self.error(f"expected {what} as key: value pairs")
-        found: dict[str, _Place] = {}
-        for key, value in self.node.value:
-            place = _Place(self.path, key)
-            name = place.text()
-            if name not in allowed:
-                raise place.error(f"unknown key {name!r} in {what}; known are {', '.join(allowed)}")
-            if name in found:
-                raise place.error(f"{name!r} appears twice")
-            found[name] = _Place(self.path, value)
-        if complete and (missing := [name for name in allowed if name not in found]):
-            raise self.error(f"{what} lacks {missing[0]}; fit the model again")
-        return found
-
-    def items(self, what: str) -> list[_Place]:
-        if not isinstance(self.node, yaml.SequenceNode):
-            raise self.error(f"expected {what} as a list")
-        return [_Place(self.path, n) for n in self.node.value]
-
-    def text(self) -> str:
-        if not isinstance(self.node, yaml.ScalarNode):
-            raise self.error("expected one value")
-        return str(self.node.value)
-
-    def quantity(self) -> tuple[float, str]:
-        """A quantity "12 deg/h" in internal units, and the unit text it was written in."""
-        text = self.text()
-        try:
-            value, unit = quantity(text)
-            if internal_unit(unit) == "degC":
-                value = float(to_internal(np.asarray(value), unit))
-            elif value:
-                value = _rounded_once(text, factor(unit, internal_unit(unit)))
-        except UnitError as problem:
-            raise self.error(str(problem)) from None
-        if not np.isfinite(value):
-            raise self.error(f"{text!r} is too large")
-        return value, unit
-
-    def number_in(self, *units: str) -> float:
-        """A quantity that must convert to one of some units, in internal units."""
-        value, written = self.quantity()
-        if not any(convertible(written, unit) for unit in units):
-            expected = " or ".join(unit or "a plain number" for unit in units)
-            raise self.error(
-                f"{self.text()!r} is " + (f"not in {expected}" if written else f"without unit: {expected}")
-            )
-        return value
-
-
-def _complaint(path: Path, line: int, message: str) -> ModelError:
-    return ModelError(f"{path.name}, line {line + 1}: {message}")
-
-
-def _rounded_once(text: str, scale: float) -> float:
-    """The number a text begins with, times a scale: rounded once, so that enough digits give any float exactly."""
-    match = _NUMBER.match(text)
-    assert match is not None
-    return float(Decimal(match[0].strip()) * Decimal(scale))
 
 
 def read_model(path: str | Path) -> GyroModel:
@@ -139,7 +63,7 @@ def read_calibration(path: str | Path) -> Calibration:
     return Calibration(model, covariance, validity, int(degrees), fit["data_hash"].text())
 
 
-def _read_covariance(place: _Place, names: list[str]) -> np.ndarray:
+def _read_covariance(place: Place, names: list[str]) -> np.ndarray:
     found = place.mapping(("parameters", "unit", "matrix"), "a covariance", complete=True)
     if [item.text() for item in found["parameters"].items("parameters")] != names:
         raise found["parameters"].error(
@@ -156,12 +80,12 @@ def _read_covariance(place: _Place, names: list[str]) -> np.ndarray:
     return matrix
 
 
-def _read(path: Path) -> tuple[GyroModel, dict[str, _Place]]:
+def _read(path: Path) -> tuple[GyroModel, dict[str, Place]]:
     """The model of a file, and the file's entries."""
-    node = _compose(path)
+    node = compose(path)
     if node is None:
-        raise _complaint(path, 0, "the file is empty; it needs a list of effects")
-    place = _Place(path, node)
+        raise complaint(path, 0, "the file is empty; it needs a list of effects")
+    place = Place(path, node)
     top = place.mapping(("gyro", "effects", "noise", *RECORD_KEYS), "a model")
     if "effects" not in top:
         raise place.error("the model lists no effects")
@@ -180,34 +104,12 @@ def _read(path: Path) -> tuple[GyroModel, dict[str, _Place]]:
         raise top["effects"].error(str(problem)) from None
 
 
-def _compose(path: Path) -> yaml.Node | None:
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise ModelError(f"{path}: no such file") from None
-    except OSError as problem:
-        raise ModelError(f"{path}: cannot be read ({problem.__class__.__name__})") from None
-    try:
-        return yaml.compose(text := data.decode(), Loader=yaml.SafeLoader)
-    except UnicodeDecodeError as problem:
-        raise _complaint(path, data[: problem.start].count(b"\n"), "not a text file in UTF-8") from None
-    except ReaderError as problem:
-        line = text[: int(problem.position)].count("\n")
-        raise _complaint(path, line, f"the character {chr(int(problem.character))!r} is not allowed") from None
-    except yaml.MarkedYAMLError as problem:
-        line = problem.problem_mark.line if problem.problem_mark else 0
-        raise _complaint(path, line, f"not valid YAML: {problem.problem}") from None
-    except (yaml.YAMLError, RecursionError, ValueError, OverflowError) as problem:
-        # PyYAML lets through what Python says of an escape beyond Unicode, or of thousands of nested brackets.
-        raise _complaint(path, 0, f"not valid YAML: {str(problem).splitlines()[0]}") from None
-
-
-def _read_effect(place: _Place) -> tuple[Effect, set[tuple[str, str]]]:
+def _read_effect(place: Place) -> tuple[Effect, set[tuple[str, str]]]:
     pairs = place.node.value if isinstance(place.node, yaml.MappingNode) else []
     named = next((value for key, value in pairs if key.value == "effect"), None)
     if named is None:
         raise place.error("each entry needs an effect: id")
-    named = _Place(place.path, named)
+    named = Place(place.path, named)
     label = named.text()
     try:
         effect = make_effect(label)
@@ -237,7 +139,7 @@ def _read_effect(place: _Place) -> tuple[Effect, set[tuple[str, str]]]:
     return effect, _read_fixed(found["fixed"], effect) if "fixed" in found else set()
 
 
-def _read_fixed(place: _Place, effect: Effect) -> set[tuple[str, str]]:
+def _read_fixed(place: Place, effect: Effect) -> set[tuple[str, str]]:
     """Which parameters are known: all (true), none (false), or those listed."""
     declared = effect.declared()
     if isinstance(place.node, yaml.SequenceNode):
@@ -251,7 +153,7 @@ def _read_fixed(place: _Place, effect: Effect) -> set[tuple[str, str]]:
     return {(effect.label, name) for name in names}
 
 
-def _read_parameter(place: _Place, effect: Effect, name: str) -> dict[str, Any]:
+def _read_parameter(place: Place, effect: Effect, name: str) -> dict[str, Any]:
     """A parameter's value, and its unit where that depends on the campaign."""
     if isinstance(place.node, yaml.MappingNode):
         inner = place.mapping(("value", "std"), name)
@@ -272,7 +174,7 @@ def _read_parameter(place: _Place, effect: Effect, name: str) -> dict[str, Any]:
     return {name: place.number_in(effect.declared()[name].unit)}
 
 
-def _read_setting(place: _Place, effect: Effect, name: str) -> Any:
+def _read_setting(place: Place, effect: Effect, name: str) -> Any:
     default = getattr(effect, name)
     if isinstance(default, str):
         return place.text()
@@ -288,7 +190,7 @@ def _read_setting(place: _Place, effect: Effect, name: str) -> Any:
     return place.quantity()[0] if isinstance(effect, BiasColumn) else place.number_in(SETTING_UNITS[name])
 
 
-def _read_noise(place: _Place) -> dict[str, float]:
+def _read_noise(place: Place) -> dict[str, float]:
     if isinstance(place.node, yaml.ScalarNode):
         if place.text() != "auto":
             raise place.error('noise is "auto" or a list of noise_* effects with values')
@@ -353,12 +255,12 @@ def _document(model: GyroModel, estimate: Estimate | None) -> dict[str, Any]:
             if isinstance(value, tuple | int | str):
                 entry[name] = list(value) if isinstance(value, tuple) else value
             elif np.isfinite(float(value)):
-                entry[name] = _exact_text(float(value), _setting_unit(effect, name, record))
+                entry[name] = exact_text(float(value), _setting_unit(effect, name, record))
         fixed = [name for name in effect.declared() if (effect.label, name) in model.fixed]
         if fixed:
             entry["fixed"] = True if len(fixed) == len(effect.declared()) else fixed
         document["effects"].append(entry)
-    noise = {k: {"effect": k, "value": _exact_text(float(v), NOISE_UNITS[k])} for k, v in model.noise.items()}
+    noise = {k: {"effect": k, "value": exact_text(float(v), NOISE_UNITS[k])} for k, v in model.noise.items()}
     if MARKOV_TIME in noise:
         noise["noise_markov"]["time_constant"] = noise.pop(MARKOV_TIME)["value"]
     document["noise"] = list(noise.values()) or "auto"
@@ -408,17 +310,5 @@ def _setting_unit(effect: Effect, name: str, record: Record | None) -> str:
 
 def _shown(values: np.ndarray, unit: str) -> Any:
     """A parameter's values, internal, as the file shows them."""
-    texts = [_exact_text(float(v), unit) for v in np.ravel(values)]
+    texts = [exact_text(float(v), unit) for v in np.ravel(values)]
     return texts if np.ndim(values) else texts[0]
-
-
-def _exact_text(value: float, unit: str) -> str | float:
-    """The shortest quantity that reads back as exactly this internal value."""
-    scale = factor(unit, internal_unit(unit))
-    if unit in ("", "1"):
-        return value
-    for digits in (15, 16, 17, 18, 19, 20, 21):
-        text = f"{Decimal(value) / Decimal(scale):.{digits}g}" if digits > 17 else f"{value / scale:.{digits}g}"
-        if _rounded_once(text, scale) == value:
-            break
-    return f"{text} {unit}"

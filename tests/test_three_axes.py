@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
-from gyromodel import cli
+from gyromodel import _diagnose_files, cli
 from gyromodel._checks import CampaignError
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis import Diagnosis, diagnose
@@ -128,10 +128,10 @@ def test_an_axis_that_cannot_be_diagnosed_leaves_the_others(tmp_path: Path, monk
         return diagnosis, "Nothing is missing."
 
     diagnosis = diagnose(x_only, model_from_effects(["scale_factor", "bias"]), hold_out=False)
-    monkeypatch.setattr(cli, "_diagnose", only_x)
-    found, said, _ = cli._diagnose_axes([campaign], tmp_path / "model.yaml", tmp_path, 0, 0)
+    monkeypatch.setattr(_diagnose_files, "diagnose_to", only_x)
+    found, said, _ = _diagnose_files.diagnose_axes([campaign], tmp_path / "model.yaml", tmp_path, 0, 0)
     assert (list(found["axes"]), found["triad"], said) == (["x"], None, "Axis x: Nothing is missing.")
     assert found["not_diagnosed"]["z"] == "the fit did not converge"
     assert "measures nothing" in found["not_diagnosed"]["y"]
     with pytest.raises(CampaignError, match="there is no axis 'x'"):
-        cli._diagnose_axes([campaign, x_only], tmp_path / "model.yaml", tmp_path, 0, 0)
+        _diagnose_files.diagnose_axes([campaign, x_only], tmp_path / "model.yaml", tmp_path, 0, 0)

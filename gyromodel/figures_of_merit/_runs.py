@@ -1,8 +1,4 @@
-"""Figures of merit of a gyro at rest as published, each with a standard uncertainty, beside its modern counterpart.
-
-Source: 2021 thesis on a fiber-optic-gyro line-of-sight stabilisation system, chapter 3, equations (3-1)-(3-7). F is the
-output at rest and S_n (or K) the nominal scale factor.
-"""
+"""Figures of merit of measured runs, each with a standard uncertainty, beside its modern counterpart."""
 
 from __future__ import annotations
 
@@ -13,13 +9,22 @@ from typing import NamedTuple, Self
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
 from scipy.stats import f as fisher
 
 from gyromodel._checks import MISSING_STEP
 from gyromodel.campaign import Campaign
 from gyromodel.effects.drivers import Bias
 from gyromodel.estimate import Estimate, EstimateError, filter_of, fit_record, with_noise_intervals
+from gyromodel.figures_of_merit._published import (
+    angle_random_walk,
+    bias,
+    bias_repeatability,
+    bias_stability,
+    bias_temperature_sensitivity,
+    powers,
+    random_walk_coefficients,
+    stability_squares,
+)
 from gyromodel.model import GyroModel
 from gyromodel.noise import deviation, with_gaps
 from gyromodel.numerics.state_space import colour
@@ -39,69 +44,6 @@ BROKEN, BROKEN_PROBABILITY, IMMATERIAL = 3.5, 1e-3, 0.05
 DRAWS, FEWEST_DRAWS, MOST_DRAWN = 400, 64, 4_000_000
 # The floor of the Allan deviation of flicker noise over its coefficient, √(2 ln 2/π).
 FLICKER_FLOOR = 0.664
-
-
-def bias(output: Float[np.ndarray, " sample"], scale_factor: float = 1.0) -> float:
-    """B0 = mean(F)/S_n (3-1)."""
-    return float(np.mean(output)) / scale_factor
-
-
-def bias_stability(output: Float[np.ndarray, " sample"], scale_factor: float = 1.0) -> float:
-    """Bs = (1/K) [Σ(F_i − mean F)²/(n − 1)]^½ (3-2)."""
-    return float(np.std(output, ddof=1)) / scale_factor
-
-
-def bias_repeatability(biases: Float[np.ndarray, " run"]) -> float:
-    """Br = [Σ(B0_i − mean B0)²/(Q − 1)]^½ over Q runs (3-3)."""
-    return float(np.std(biases, ddof=1))
-
-
-def bias_temperature_sensitivity(
-    biases: Float[np.ndarray, " point"], temperatures: Float[np.ndarray, " point"], room: int
-) -> tuple[float, int]:
-    """Bt = max_i |B0_i − B0_m|/|T_i − T_m|, m the point at room temperature (3-4), and the point that it comes from."""
-    difference = np.abs(temperatures - temperatures[room])
-    ratio = np.divide(np.abs(biases - biases[room]), difference, out=np.zeros(len(biases)), where=difference > 0)
-    return float(ratio.max()), int(ratio.argmax())
-
-
-def angle_random_walk(output: Float[np.ndarray, " sample"], bandwidth: float, scale_factor: float = 1.0) -> float:
-    """ARW = RMS/√W about the mean (3-5)(3-6).
-
-    Args:
-        output: samples of F.
-        bandwidth: W (Hz). With the two-sided 1/τ1 of samples that are means over τ1, ARW is the coefficient N of white
-            noise; a one-sided bandwidth 1/(2τ1) gives √2 N.
-        scale_factor: K.
-    """
-    return bias_stability(output, scale_factor) / float(np.sqrt(bandwidth))
-
-
-def random_walk_coefficients(
-    times: Float[np.ndarray, " time"], squares: Float[np.ndarray, " time"]
-) -> Float[np.ndarray, " coefficient"]:
-    """a0, a1, a2 of Bs²(τ) = a0 + a1/τ + a2/τ² by least squares; RWC = √a1 (3-7)."""
-    return np.linalg.lstsq(_powers(times), squares, rcond=None)[0]
-
-
-def stability_squares(
-    rate: Float[np.ndarray, "*batch sample"], lengths: Int[np.ndarray, " time"]
-) -> Float[np.ndarray, "*batch time"]:
-    """Bs²(τ): the variance (3-2) of means.
-
-    Args:
-        rate: of a gyro at rest.
-        lengths: of the means, in samples.
-
-    Returns:
-        In the square of the rate's unit.
-    """
-    found = []
-    for k in lengths:
-        whole = rate.shape[-1] // k * k
-        means = rate[..., :whole].reshape(*rate.shape[:-1], -1, k).mean(axis=-1)
-        found.append(means.var(axis=-1, ddof=1))
-    return np.stack(found, axis=-1)
 
 
 @dataclass(frozen=True)
@@ -303,12 +245,12 @@ def _random_walk(times: np.ndarray, squares: np.ndarray, drawn: np.ndarray) -> t
         return np.nan, np.nan, f"fewer than {FEWEST_TIMES} averaging times; take {FEWEST_SAMPLES} samples"
     covariance = np.cov(drawn.T)
     a1 = float(random_walk_coefficients(times, squares)[1])
-    row = np.linalg.pinv(_powers(times))[1]
+    row = np.linalg.pinv(powers(times))[1]
     a1_std = float(np.sqrt(row @ covariance @ row))
     # Hotelling's test of the fit: the covariance is known from a number of draws.
     root = np.linalg.cholesky(covariance)
     left = np.linalg.solve(root, squares)
-    design = np.linalg.solve(root, _powers(times))
+    design = np.linalg.solve(root, powers(times))
     rest = left - design @ np.linalg.lstsq(design, left, rcond=None)[0]
     free, draws = len(times) - 3, len(drawn)
     p = float(fisher.sf(rest @ rest * (draws - free) / (free * (draws - 1)), free, draws - free))
@@ -317,10 +259,6 @@ def _random_walk(times: np.ndarray, squares: np.ndarray, drawn: np.ndarray) -> t
     if a1 < 2.0 * a1_std:
         return np.nan, np.nan, f"a1 is not above zero: {a1 / a1_std:.1f} standard uncertainties; take a longer run"
     return float(np.sqrt(a1)), a1_std / (2.0 * float(np.sqrt(a1))), ""
-
-
-def _powers(times: np.ndarray) -> np.ndarray:
-    return np.stack([np.ones(len(times)), 1.0 / times, 1.0 / times**2], axis=1)
 
 
 class _Point(NamedTuple):

@@ -1,0 +1,70 @@
+"""What the diagnose command writes: for one axis, and for the axes of a campaign together."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gyromodel._atomic import write_text
+from gyromodel._console import json_text, prepare_folder, progress_bar
+
+if TYPE_CHECKING:
+    from gyromodel.campaign import Campaign
+    from gyromodel.diagnosis import Diagnosis
+
+REPORTS = ("report.html", "diagnosis.json", "model.yaml")
+
+
+def diagnose_to(
+    measured: Sequence[Campaign], model: Path, output: Path, *, calibrate: int = 0, seed: int = 0
+) -> tuple[Diagnosis, str]:
+    """Diagnose one axis and write the results; and the verdict in a sentence."""
+    prepare_folder(output, model)
+    from gyromodel.diagnosis import diagnose
+    from gyromodel.model_files import read_model, write_model
+    from gyromodel.report import sentence, write_report
+
+    start = read_model(model)
+    with progress_bar() as progress:
+        diagnosis: Diagnosis = diagnose(measured, start, calibrate=calibrate, seed=seed, progress=progress)
+    write_model(diagnosis.extended, output / "model.yaml")
+    write_text(output / "diagnosis.json", json_text(diagnosis.to_dict() | {"model": "model.yaml"}))
+    write_report(diagnosis, output)
+    return diagnosis, sentence(diagnosis)
+
+
+def diagnose_axes(
+    measured: Sequence[Campaign], model: Path, output: Path, calibrate: int, seed: int
+) -> tuple[dict[str, Any], str, tuple[str, ...]]:
+    """Diagnose each axis that can be, and how the axes lie together; the answer, its words, the files."""
+    from gyromodel._checks import CampaignError
+    from gyromodel.estimate import EstimateError
+    from gyromodel.model import ModelError
+    from gyromodel.three_axes import triad
+
+    axes, not_diagnosed, said, written, extended = {}, {}, [], [], {}
+    for name in measured[0].outputs:
+        axis = name.removeprefix("output_")
+        dead = [reason for c in measured if name in c.columns and (reason := c.dead(name))]
+        try:
+            if not dead:
+                alone = [campaign.axis(axis) for campaign in measured]
+                diagnosis, verdict = diagnose_to(alone, model, output / axis, calibrate=calibrate, seed=seed)
+        except (EstimateError, ModelError) as error:
+            dead = [str(error)]
+        if dead:
+            not_diagnosed[axis] = dead[0]
+            continue
+        axes[axis], extended[axis] = diagnosis.to_dict() | {"model": f"{axis}/model.yaml"}, diagnosis.extended
+        said.append(f"Axis {axis}: {verdict}")
+        written += [f"{axis}/{report}" for report in REPORTS]
+    if not axes:
+        raise CampaignError(f"no axis can be diagnosed; {'; '.join(f'{a}: {why}' for a, why in not_diagnosed.items())}")
+    for axis, reason in not_diagnosed.items():
+        print(f"gyromodel: axis {axis} was not diagnosed: {reason}", file=sys.stderr)
+    lie = triad(measured, extended)
+    result = {"axes": axes, "not_diagnosed": not_diagnosed, "triad": lie and lie.to_dict()}
+    write_text(output / "axes.json", json_text(result))
+    return result, "\n".join([*said, *([lie.sentence()] if lie else [])]), (*written, "axes.json")
