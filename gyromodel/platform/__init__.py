@@ -1,0 +1,23 @@
+"""A stabilised platform: the Earth it is over, and its navigation from gyros and accelerometers."""
+
+from gyromodel.platform._drift import residual_drift
+from gyromodel.platform._earth import EARTH_RATE, earth_rate, gravity, radii, transport_rate
+from gyromodel.platform._increments import coning, integrals, sculling
+from gyromodel.platform._navigation import Navigation, attitudes, navigate
+from gyromodel.platform._sensitivity import attitude_sensitivity
+
+__all__ = [
+    "EARTH_RATE",
+    "Navigation",
+    "attitude_sensitivity",
+    "attitudes",
+    "coning",
+    "earth_rate",
+    "gravity",
+    "integrals",
+    "navigate",
+    "radii",
+    "residual_drift",
+    "sculling",
+    "transport_rate",
+]

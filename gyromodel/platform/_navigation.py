@@ -1,0 +1,137 @@
+"""Navigation of a space-stabilised platform in north-up-east axes, and of anything else that carries its sensors.
+
+Source: Zhang, Jiang, Jing and Wang, doi:10.19306/j.cnki.2095-8110.2022.06.009, 2022, equation (1).
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from gyromodel.numerics.rotations import cross, exponential, normalise, product, rotate
+from gyromodel.platform._earth import earth_rate, gravity, radii, transport_rate
+
+
+class Navigation(NamedTuple):
+    """Attitude, velocity and position of a platform; a history has an axis of epochs in front.
+
+    attitude: quaternion that turns vectors from platform to north-up-east axes; velocity: north, up, east (m/s);
+    position: latitude, longitude (rad) and height (m).
+    """
+
+    attitude: Float[Array, "*epoch 4"]
+    velocity: Float[Array, "*epoch 3"]
+    position: Float[Array, "*epoch 3"]
+
+
+@partial(jax.jit, static_argnames="every")
+def attitudes(start: Float[Array, "4"], rotations: Float[Array, "step 3"], every: int = 1) -> Float[Array, "epoch 4"]:
+    """Attitude in inertial axes, q ← q ∘ exp(φ) at each step: exact for the rotation vectors φ.
+
+    Args:
+        start: quaternion from body to reference before the first step.
+        rotations: rotation vector of each step in the axes of the body, rad.
+        every: steps between two epochs of the history.
+
+    Returns:
+        Quaternions at the end of each epoch; `to_matrix` makes direction cosine matrices of them.
+
+    Raises:
+        ValueError: the steps are not a whole number of epochs.
+    """
+
+    # In reverse mode each epoch is computed again: what is kept is no longer than the history.
+    @jax.checkpoint
+    def epoch(q, turns):
+        q = normalise(jax.lax.scan(lambda q, turn: (product(q, exponential(turn)), None), q, turns)[0])
+        return q, q
+
+    return jax.lax.scan(epoch, start, in_epochs(rotations, every))[1]
+
+
+@partial(jax.jit, static_argnames="every")
+def navigate(
+    start: Navigation,
+    rotations: Float[Array, "step 3"],
+    velocities: Float[Array, "step 3"],
+    step: Float[Array, ""] | float,
+    every: int = 1,
+) -> Navigation:
+    """Attitude, then velocity, then position, from what gyros and accelerometers on the platform sense.
+
+    Ċ_p^n = C_p^n [ω_np^p ×],  v̇^n = f^n − (2 ω_ie^n + ω_en^n) × v^n + g^n,
+    L̇ = v_N/(R_M + h),  λ̇ = v_E/((R_N + h) cos L),  ḣ = v_U.
+
+    The platform turns in inertial space by the rotation vectors of the steps; the Earth, its gravity and the velocity
+    are taken in the middle of each epoch (explicit midpoint rule, of second order in its length). Height is that of
+    pure inertial navigation, whose errors grow e-fold in some ten minutes.
+
+    Args:
+        start: before the first step.
+        rotations: rotation vector of the platform relative to inertial space in each step, in its own axes, rad: that
+            of its residual drift, or zero for ideal gyros.
+        velocities: integral of the specific force over each step, in the platform axes at its start, m/s.
+        step: length of a step, s.
+        every: steps in an epoch.
+
+    Returns:
+        The history, at the end of each epoch.
+
+    Raises:
+        ValueError: the steps are not a whole number of epochs.
+    """
+    length = step * every
+
+    def sense(carry, increments):
+        turned, pushed = carry
+        turn, push = increments
+        return (product(turned, exponential(turn)), pushed + rotate(turned, push)), None
+
+    @jax.checkpoint
+    def epoch(now, increments):
+        still = jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3)
+        (turned, pushed), _ = jax.lax.scan(sense, still, increments)
+        pushed = rotate(now.attitude, pushed)
+
+        earth, transport, fall = _of_place(now.position, now.velocity)
+        half = now.velocity + 0.5 * (pushed + length * (fall - cross(2 * earth + transport, now.velocity)))
+        middle = now.position + 0.5 * length * _position_rate(now.position, now.velocity)
+
+        earth, transport, fall = _of_place(middle, half)
+        frame = length * (earth + transport)
+        attitude = normalise(product(exponential(-frame), product(now.attitude, turned)))
+        change = pushed - 0.5 * cross(frame, pushed) + length * (fall - cross(2 * earth + transport, half))
+        position = now.position + length * _position_rate(middle, now.velocity + 0.5 * change)
+        now = Navigation(attitude, now.velocity + change, position)
+        return now, now
+
+    increments = in_epochs(rotations, every), in_epochs(velocities, every)
+    return jax.lax.scan(epoch, start, increments)[1]
+
+
+def in_epochs(rows: jax.Array, every: int) -> jax.Array:
+    """Rows as epochs of some steps each."""
+    if len(rows) % every:
+        raise ValueError(
+            f"{len(rows)} steps are not a whole number of epochs of {every} steps: leave out the last ones"
+        )
+    return rows.reshape(-1, every, *rows.shape[1:])
+
+
+def _of_place(position: jax.Array, velocity: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Earth rate, transport rate and gravity in north-up-east axes."""
+    latitude, height = position[0], position[2]
+    fall = jnp.array([0.0, -1.0, 0.0]) * gravity(latitude, height)
+    return earth_rate(latitude), transport_rate(latitude, height, velocity), fall
+
+
+def _position_rate(position: jax.Array, velocity: jax.Array) -> jax.Array:
+    """Rates of latitude, longitude and height."""
+    latitude, _, height = position
+    meridian, across = radii(latitude)
+    north, up, east = velocity
+    return jnp.stack([north / (meridian + height), east / ((across + height) * jnp.cos(latitude)), up])
