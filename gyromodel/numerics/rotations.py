@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-Quaternion = Float[Array, "*batch 4"]
-Vector = Float[Array, "*batch 3"]
-Matrix = Float[Array, "*batch 3 3"]
+Quaternion = Float[Array, "*#batch 4"]
+Vector = Float[Array, "*#batch 3"]
+Matrix = Float[Array, "*#batch 3 3"]
 
 # Squared angle below which functions of the angle are taken from their series: there the term left out is below the
 # last digit. Divided by an angle of zero they would have no derivative.

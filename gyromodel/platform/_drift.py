@@ -17,7 +17,7 @@ def residual_drift(models: Sequence[GyroModel], signals: Sequence[Signals]) -> F
     Each axis turns at the rate that its gyro takes for rest: minus its output at rest over the slope there.
 
     Args:
-        models: one gyro for each axis, x, y and z.
+        models: one gyro for each axis, x, y and z; fitted ones, or prepared on the signals.
         signals: what their effects see; a rate among them is not used.
     """
     still = [{**s, "rate": jnp.zeros_like(s["time"])} for s in signals]

@@ -19,8 +19,8 @@ SOMIGLIANA = 0.00193185265241
 CENTRIFUGAL = EARTH_RATE**2 * SEMI_MAJOR_AXIS**3 * (1 - FLATTENING) / GRAVITATIONAL_CONSTANT
 ECCENTRICITY_SQUARED = FLATTENING * (2 - FLATTENING)
 
-Scalar = Float[Array, "*batch"]
-Vector = Float[Array, "*batch 3"]
+Scalar = Float[Array, "*#batch"]
+Vector = Float[Array, "*#batch 3"]
 
 
 def radii(latitude: Scalar) -> tuple[Scalar, Scalar]:

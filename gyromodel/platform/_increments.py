@@ -43,7 +43,7 @@ def coning(angles: Float[Array, "step 3"]) -> Float[Array, "step 3"]:
     """Rotation vectors φ_k = α_k + α_{k−1} × α_k / 12 of steps in which the body turns by the integrals α of its rates.
 
     Args:
-        angles: integrals of the rates over each step, rad. The first step has none before it and is left as it is.
+        angles: integrals of the rates over each step, rad. What is before the first is extrapolated.
     """
     return angles + cross(_previous(angles), angles) / 12
 
@@ -63,5 +63,6 @@ def sculling(angles: Float[Array, "step 3"], velocities: Float[Array, "step 3"])
 
 
 def _previous(increments: jax.Array) -> jax.Array:
-    """The increments one step before; the first meets itself, so that its cross terms vanish."""
-    return jnp.concatenate([increments[:1], increments[:-1]])
+    """The increments one step before, those of the first by a line through it and the next."""
+    first = 2 * increments[0] - increments[min(1, len(increments) - 1)]
+    return jnp.concatenate([first[None], increments[:-1]])

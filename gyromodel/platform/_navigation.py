@@ -29,7 +29,7 @@ class Navigation(NamedTuple):
 
 
 @partial(jax.jit, static_argnames="every")
-def attitudes(start: Float[Array, "4"], rotations: Float[Array, "step 3"], every: int = 1) -> Float[Array, "epoch 4"]:
+def attitudes(start: Float[Array, " 4"], rotations: Float[Array, "step 3"], every: int = 1) -> Float[Array, "epoch 4"]:
     """Attitude in inertial axes, q ← q ∘ exp(φ) at each step: exact for the rotation vectors φ.
 
     Args:
@@ -91,20 +91,23 @@ def navigate(
         turn, push = increments
         return (product(turned, exponential(turn)), pushed + rotate(turned, push)), None
 
+    def accelerated(position, velocity, pushed):
+        """Rotation of the axes in an epoch, and change of velocity where its middle is at a position and velocity."""
+        earth, transport, fall = _of_place(position, velocity)
+        turn = length * (earth + transport)
+        return turn, pushed - 0.5 * cross(turn, pushed) + length * (fall - cross(2 * earth + transport, velocity))
+
     @jax.checkpoint
     def epoch(now, increments):
         still = jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3)
         (turned, pushed), _ = jax.lax.scan(sense, still, increments)
         pushed = rotate(now.attitude, pushed)
 
-        earth, transport, fall = _of_place(now.position, now.velocity)
-        half = now.velocity + 0.5 * (pushed + length * (fall - cross(2 * earth + transport, now.velocity)))
+        _, change = accelerated(now.position, now.velocity, pushed)
         middle = now.position + 0.5 * length * _position_rate(now.position, now.velocity)
+        turn, change = accelerated(middle, now.velocity + 0.5 * change, pushed)
 
-        earth, transport, fall = _of_place(middle, half)
-        frame = length * (earth + transport)
-        attitude = normalise(product(exponential(-frame), product(now.attitude, turned)))
-        change = pushed - 0.5 * cross(frame, pushed) + length * (fall - cross(2 * earth + transport, half))
+        attitude = normalise(product(exponential(-turn), product(now.attitude, turned)))
         position = now.position + length * _position_rate(middle, now.velocity + 0.5 * change)
         now = Navigation(attitude, now.velocity + change, position)
         return now, now

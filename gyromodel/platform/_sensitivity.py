@@ -19,13 +19,13 @@ def attitude_sensitivity(
     function: Callable[..., Float[Array, "step 3"]],
     parameters: Any,
     rows: Any,
-    start: Float[Array, "4"],
+    start: Float[Array, " 4"],
     every: int,
 ) -> tuple[Float[Array, "epoch 4"], Any]:
     """The attitudes that `attitudes` gives, and their derivatives by any number of parameters.
 
-    q(p + δp) = exp(S δp) ∘ q(p): S_k = S_{k−1} + C_{k−1} J(φ_k) ∂φ_k/∂p, C the direction cosines before step k and J the
-    left Jacobian. The sum over an epoch is three products of a row with ∂φ/∂p, however many parameters there are.
+    q(p + δp) = exp(S δp) ∘ q(p): S_k = S_{k−1} + C_{k−1} J(φ_k) ∂φ_k/∂p, with C the direction cosines before step k and
+    J the left Jacobian. The sum over an epoch is three products of a row with ∂φ/∂p, however many parameters there are.
 
     Args:
         function: `function(parameters, rows)`, the rotation vectors of some steps, each from its own row alone. Defined

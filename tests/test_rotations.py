@@ -1,0 +1,79 @@
+"""Rotations against scipy's, the axioms of the group, and power series worked out by hand for tiny angles."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gyromodel.numerics import rotations as so3
+
+ANGLES = [0.0, 1e-160, 1e-9, 1e-5, 0.09, 0.11, 1.0, 3.0, np.pi]
+# One rotation an angle, all about one skew axis.
+AXIS = np.array([0.6, -0.48, 0.64])
+VECTORS = np.outer(ANGLES, AXIS)
+QUATERNIONS = np.concatenate([np.cos(np.array(ANGLES) / 2)[:, None], np.outer(np.sin(np.array(ANGLES) / 2), AXIS)], 1)
+
+
+def drawn(rng: np.random.Generator, rows: int = 9) -> np.ndarray:
+    return Rotation.random(rows, rng=rng).as_quat(scalar_first=True)
+
+
+def test_exponential_and_logarithm_to_the_last_digit():
+    found = np.asarray(so3.exponential(jnp.asarray(VECTORS)))
+    assert np.allclose(found, QUATERNIONS, rtol=4e-16, atol=1e-16)
+    # Tiny parts too, which an absolute tolerance would not see.
+    assert np.allclose(found[:5, 1:], QUATERNIONS[:5, 1:], rtol=4e-16, atol=0)
+    back = np.asarray(so3.logarithm(jnp.asarray(QUATERNIONS)))
+    assert np.allclose(back, VECTORS, rtol=1e-15, atol=0)
+    assert np.allclose(so3.logarithm(-jnp.asarray(QUATERNIONS[:-1])), VECTORS[:-1], rtol=1e-15, atol=0)
+    beyond = so3.logarithm(so3.exponential(jnp.asarray(4.0 * AXIS)))
+    assert np.allclose(beyond, (4.0 - 2 * np.pi) * AXIS, rtol=1e-14)
+
+
+def test_the_group(rng: np.random.Generator):
+    p, q, r = (jnp.asarray(drawn(rng)) for _ in range(3))
+    identity = jnp.broadcast_to(jnp.array([1.0, 0.0, 0.0, 0.0]), q.shape)
+    near = {"rtol": 0, "atol": 4e-15}
+    assert np.allclose(so3.product(so3.product(p, q), r), so3.product(p, so3.product(q, r)), **near)
+    assert np.allclose(so3.product(q, so3.inverse(q)), identity, **near)
+    assert np.allclose(so3.product(identity, q), q, **near)
+    assert np.allclose(so3.to_matrix(so3.product(p, q)), so3.to_matrix(p) @ so3.to_matrix(q), **near)
+    assert np.allclose(so3.normalise(3.0 * q), q, **near)
+
+
+def test_the_same_as_scipy(rng: np.random.Generator):
+    q, v = drawn(rng), rng.standard_normal((9, 3))
+    theirs = Rotation.from_quat(q, scalar_first=True)
+    assert np.allclose(so3.to_matrix(jnp.asarray(q)), theirs.as_matrix(), atol=4e-15)
+    assert np.allclose(so3.rotate(jnp.asarray(q), jnp.asarray(v)), theirs.apply(v), atol=1e-14)
+    assert np.allclose(so3.logarithm(jnp.asarray(q)), theirs.as_rotvec(), atol=1e-14)
+    assert np.allclose(so3.cross(jnp.asarray(v), jnp.asarray(v[::-1])), np.cross(v, v[::-1]), atol=4e-15)
+
+
+def test_matrix_and_back_half_turns_included(rng: np.random.Generator):
+    half = [[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.0]]
+    q = np.concatenate([half, drawn(rng, 5)])
+    found = np.asarray(so3.from_matrix(jnp.asarray(Rotation.from_quat(q, scalar_first=True).as_matrix())))
+    assert np.allclose(np.abs(np.sum(found * q, axis=1)), 1.0, atol=4e-15)
+    assert (found[:, 0] >= 0).all()
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-8, 0.05, 0.15, 2.0])
+def test_derivatives(angle: float):
+    """exp(φ + δ) = exp(J δ) ∘ exp(φ), and log takes both away; at zero the derivative of exp is half the identity."""
+    vector = jnp.asarray(angle * AXIS)
+    slope = np.asarray(jax.jacfwd(so3.exponential)(vector))
+    jacobian = np.asarray(jax.vmap(so3.left_jacobian, (None, 1), 1)(vector, jnp.eye(3)))
+    back = so3.inverse(so3.exponential(vector))
+    pushed = np.stack([2 * so3.product(jnp.asarray(slope[:, k]), back)[1:] for k in range(3)], axis=1)
+    assert np.allclose(pushed, jacobian, atol=2e-15)
+    assert np.allclose(jax.jacrev(so3.logarithm)(so3.exponential(vector)) @ slope, np.eye(3), atol=4e-15)
+    # The mean of all turns from nothing to φ, by Gauss-Legendre quadrature.
+    nodes, weights = np.polynomial.legendre.leggauss(20)
+    turns = Rotation.from_rotvec(np.outer((nodes + 1) / 2 * angle, AXIS)).as_matrix()
+    assert np.allclose(jacobian, np.tensordot(weights / 2, turns, 1), atol=1e-14)
+    if angle == 0:
+        assert np.allclose(slope, np.concatenate([np.zeros((1, 3)), np.eye(3) / 2]), atol=0)
