@@ -8,6 +8,7 @@ Source: M. D. Shuster, *A Survey of Attitude Representations*, J. Astronautical 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import reduce
 from math import factorial
 
 import jax
@@ -57,14 +58,21 @@ def cross(a: Vector, b: Vector) -> Vector:
 def exponential(rotation_vector: Vector) -> Quaternion:
     """(cos θ/2, sin(θ/2)/θ · φ), θ = |φ|: the rotation by the angle |φ| about φ."""
     squared = _squared(rotation_vector)
-    cosine = _by_series(
-        squared, lambda angle: jnp.cos(0.5 * angle), [(-0.25) ** k / factorial(2 * k) for k in range(TERMS)]
+    halves = [(-0.25) ** k for k in range(TERMS)]
+    terms = (
+        [h / factorial(2 * k) for k, h in enumerate(halves)],
+        [0.5 * h / factorial(2 * k + 1) for k, h in enumerate(halves)],
     )
-    sine = _by_series(
-        squared,
-        lambda angle: jnp.sin(0.5 * angle) / angle,
-        [0.5 * (-0.25) ** k / factorial(2 * k + 1) for k in range(TERMS)],
-    )
+
+    def small(squared):
+        return tuple(_horner(t, squared) for t in terms)
+
+    def any_size(squared):
+        cosine = _by_series(squared, lambda angle: jnp.cos(0.5 * angle), terms[0])
+        return cosine, _by_series(squared, lambda angle: jnp.sin(0.5 * angle) / angle, terms[1])
+
+    # The steps of a gyro are small: without sine and cosine they take half the time.
+    cosine, sine = jax.lax.cond(jnp.all(squared < SMALL), small, any_size, squared)
     return jnp.concatenate([cosine[..., None], sine[..., None] * rotation_vector], axis=-1)
 
 
@@ -152,5 +160,10 @@ def _squared(v: jax.Array) -> jax.Array:
 def _by_series(squared: jax.Array, function: Callable[[jax.Array], jax.Array], terms: list[float]) -> jax.Array:
     """f(√s), for small s by its power series in s; neither branch meets what it cannot differentiate."""
     small = squared < SMALL
-    series = jnp.polyval(jnp.asarray(terms[::-1]), jnp.where(small, squared, 0.0), unroll=TERMS + 1)
+    series = _horner(terms, jnp.where(small, squared, 0.0))
     return jnp.where(small, series, function(jnp.sqrt(jnp.where(small, 1.0, squared))))
+
+
+def _horner(terms: list[float], x: jax.Array) -> jax.Array:
+    """Σ terms[k] xᵏ, written out."""
+    return reduce(lambda total, term: total * x + term, reversed(terms), jnp.zeros_like(x))
