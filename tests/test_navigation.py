@@ -290,7 +290,7 @@ def corrected(parameters: dict[str, jax.Array], rows: tuple[jax.Array, jax.Array
 
 
 def test_sensitivity_is_the_derivative():
-    """By jvp, parameter by parameter, and by finite differences."""
+    """By jvp along a direction in all parameters."""
     angle = jnp.asarray(integrated(END, STEPS)[0])
     rows = angle, jnp.concatenate([angle[:1], angle[:-1]])
     parameters = {"bias": jnp.array([1e-5, -2e-5, 3e-5]), "matrix": jnp.eye(3) + 0.01 * jnp.arange(9.0).reshape(3, 3)}
@@ -300,16 +300,11 @@ def test_sensitivity_is_the_derivative():
     def history_of(p):
         return attitudes(START.attitude, corrected(p, rows), EVERY * 4)
 
-    plain, moved = jax.jvp(history_of, (parameters,), (direction,))
+    plain, moved = jax.jit(lambda p, d: jax.jvp(history_of, (p,), (d,)))(parameters, direction)
     assert np.allclose(history, plain, atol=1e-14)
     expected = 2 * np.asarray(product(moved, inverse(plain)))[:, 1:]
     along = np.tensordot(found["bias"], direction["bias"], 1) + np.tensordot(found["matrix"], direction["matrix"], 2)
     assert np.abs(along - expected).max() < 1e-12 * np.abs(expected).max()
-    ahead, behind = (
-        history_of(jax.tree.map(lambda p, d, s=s: p + s * d, parameters, direction)) for s in (1e-8, -1e-8)
-    )
-    slopes = np.asarray(logarithm(product(ahead, inverse(behind)))) / 2e-8
-    assert np.abs(along - slopes).max() < 1e-8 * np.abs(expected).max()
 
 
 def miss(bias: jax.Array, turns: jax.Array, pushes: jax.Array) -> jax.Array:
