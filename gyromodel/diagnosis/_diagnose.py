@@ -145,7 +145,7 @@ def diagnose(
         again = _Session(Scanner(weighted, bank, grid, stated=alike.noise_given), session.threshold)
         other = again.run(alike, say)
         if _unfinished(other):
-            # Structure that is left passes for a level that varies; what looked like structure may have been that level.
+            # Structure that is left passes for a level that varies; without any left, the level passed for structure.
             grows = None
         else:
             record, baseline, session, selection = weighted, alike, again, other

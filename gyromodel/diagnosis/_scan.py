@@ -31,8 +31,8 @@ THREADS = 2
 # Lines whose interpolated statistic, were it this much larger, would not pay for the search are left interpolated.
 PEAK_SLACK = 1.5
 NO_LINES = np.zeros(0)
-# Further gross errors that are given up with the greatest: evidence of each alone (nats), the search over rows paid for,
-# and rows to the next, as errors side by side share theirs.
+# Further gross errors that are given up with the greatest: evidence of each alone (nats), the search over rows paid
+# for, and rows to the next, as errors side by side share theirs.
 ERROR_MARGIN, ERROR_DISTANCE = 8.0, 3
 # Records this short are test points, each of which may be anomalous; longer ones are series with single gross errors.
 TEST_POINTS = 40
@@ -376,13 +376,15 @@ class Scanner:
 def _gross(t: np.ndarray, where: np.ndarray, rss: float, nu: int) -> list[int]:
     """The greatest of many gross errors and, after it, each that is certain once those before it are given up."""
     order = np.argsort(-t)
-    chosen, rss = [int(order[0])], rss - t[order[0]]
+    chosen, left = [int(order[0])], float(rss - t[order[0]])
     for i in order[1:]:
         if np.abs(where[chosen] - where[i]).min() < ERROR_DISTANCE:
             continue
-        alone = log_evidence_ratio(np.minimum(t[i], rss), rss, nu - len(chosen), 1) - np.log(len(t))
-        if not (rss > 0 and alone > ERROR_MARGIN):
+        if not 0.0 < t[i] < left:
+            break
+        alone = log_evidence_ratio(t[[i]], left, nu - len(chosen), 1)[0] - np.log(len(t))
+        if alone < ERROR_MARGIN:
             break
         chosen.append(int(i))
-        rss = rss - t[i]
+        left -= float(t[i])
     return chosen

@@ -283,7 +283,7 @@ def _finish(
             replace(effect)
         except ValueError as problem:
             raise EstimateError(
-                f"the fit left what {effect.label} can be ({problem}): give start values nearer the solution, or fix some"
+                f"the fit left what {effect.label} can be ({problem}): give start values nearer the solution"
             ) from None
     ordinary = variance is not None
     predicted, jacobian = model.linearise(record.signals)

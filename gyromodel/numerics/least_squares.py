@@ -62,7 +62,7 @@ def levenberg_marquardt(
         promise = -float(g @ step)
         if promise <= tolerance * cost:
             # Under heavy damping a small promise says nothing: then the residual must be orthogonal to every column, or
-            # the last step, so short that it cost next to nothing, still led up, as where the sum of squares has a kink.
+            # the last step, so short that it cost next to nothing, still led up, as where the cost has a kink.
             orthogonal = np.all(np.abs(g) <= 1e-6 * scale * np.sqrt(cost))
             return Solution(
                 x, cost, iteration, bool(damping < 1.0 or orthogonal or worse <= KINK_TOLERANCE * tolerance * cost)
