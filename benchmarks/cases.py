@@ -197,7 +197,7 @@ def fog_closed_loop_ramp(folder: Path) -> list[str]:
         ("bias alone", left(later, "bias")),
         ("and the codes' error", left(later, "bias", "bias_readout_code")),
         ("and all that was named", left(later, *extended.labels)),
-        ("bias, the codes' error and twice the mains, its phase from the line at 50 Hz", mains),
+        ("bias, the codes' error and twice the mains, whose phase is read from the line at 50 Hz in these 80 s", mains),
     )
     rows = [[label, f"{1e9 * rest.std():.0f}"] for label, rest in steps]
     said = f"`diagnose`: {causes(result)}; {seconds:.0f} s."

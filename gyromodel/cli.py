@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from io import TextIOWrapper
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -25,9 +25,6 @@ from gyromodel._console import (
     refuse_overwriting,
 )
 from gyromodel._diagnose_files import REPORTS, diagnose_axes, diagnose_to
-
-if TYPE_CHECKING:
-    pass
 
 DATA = Path(__file__).parent / "data"
 # Help without rich: it loads in half the time.
@@ -341,7 +338,8 @@ def effects(
         hint = f"; did you mean {' or '.join(close)}?" if close else "; `gyromodel effects` lists them"
         raise typer.BadParameter(f"no effect is called {effect}{hint}", param_hint="ID")
     if as_json:
-        entries = asdict(catalogue[effect]) if effect else [asdict(entry) for entry in catalogue.values()]
+        every = [*catalogue.values(), *NOISE.values()]
+        entries = asdict(catalogue[effect]) if effect else [asdict(entry) for entry in every]
         print(json_text(entries), end="")
     elif effect is None:
         rows = [(e.id, e.site, ", ".join(e.needs) or "–", e.equation) for e in catalogue.values()]

@@ -83,11 +83,13 @@ def test_search_statistics_equal_dense_algebra(rng: np.random.Generator) -> None
     null = rss(ones)
     assert result.rss == pytest.approx(null, rel=1e-9)
     for name, (form, explained, _) in result.best.items():
-        assert isinstance(form, int)
-        if name == "bias_step":
+        if name == "outliers":
+            assert isinstance(form, tuple)
+            column = np.eye(ROWS)[:, form[:1]]
+        elif isinstance(form, tuple):
+            pytest.fail(f"{name} has {form}")
+        elif name == "bias_step":
             column = (np.arange(ROWS) >= form)[:, None].astype(float)
-        elif name == "outliers":
-            column = np.eye(ROWS)[:, [form]]
         elif name == "bias_periodic":
             assert scanner.lines is not None
             phase = 2 * np.pi * scanner.lines.frequencies[form] * time
@@ -303,6 +305,20 @@ def test_several_lines_are_one_cause(rng: np.random.Generator) -> None:
     # Standard error of a frequency: √6 σ / (π A T √n).
     tolerance = 6 * np.sqrt(6) / (np.pi * 2 * time[-1] * np.sqrt(ROWS))
     assert frequency == pytest.approx([0.0031, 0.0117], abs=tolerance)
+
+
+def test_many_gross_errors_are_given_up_together(rng: np.random.Generator) -> None:
+    """More of them than the search has rounds, beside a bias over temperature."""
+    wild = np.sort(rng.choice(ROWS // 5, 20, replace=False)) * 5
+    wrong = np.zeros(ROWS)
+    wrong[wild] = rng.choice([-1.0, 1.0], 20) * rng.uniform(15.0, 60.0, 20)
+    log = static_log(rng, wrong)
+    log = log.with_column("output", log.columns["output"] + 0.1 * (log.columns["temperature"] - 20.0), "deg/h")
+    found = gm.diagnose(log, gm.model_from_effects(["bias"]), hold_out=False)
+    assert found.verdict == "named"
+    assert [c.effect for c in found.causes] == ["bias_temperature"]
+    rows = ", ".join(str(row + 1) for row in wild[:12])
+    assert f"20 gross errors in data rows {rows}…: given up, not modelled." in found.findings
 
 
 def test_many_steps_are_a_function_of_time_and_no_cause(rng: np.random.Generator) -> None:

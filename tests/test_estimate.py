@@ -11,7 +11,7 @@ import pytest
 from gyromodel.campaign import Campaign
 from gyromodel.effects.drivers import Bias, BiasDrift
 from gyromodel.effects.scale import ScaleFactor
-from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureCurve
+from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureCurve, BiasWarmup
 from gyromodel.estimate import Estimate, EstimateError, _fit, fit, fit_record, two_stage, with_noise_intervals
 from gyromodel.model import GyroModel, ModelError, draw_noise, model_from_effects, record_span
 from gyromodel.noise import NoiseRatios, markov_sum
@@ -388,6 +388,20 @@ def test_a_fit_that_does_not_converge_is_refused(rng: np.random.Generator, monke
     monkeypatch.setattr(_fit, "optimistix_solution", lambda *_: lost)
     with pytest.raises(EstimateError, match="fit of bias did not converge in 100 iterations: give start values"):
         fit_record(read_signals(campaign(rng)), model_from_effects(["bias"]), ratios=RATIOS)
+
+
+@pytest.mark.parametrize("start", [2.0, 20.0, 1e5])
+def test_a_far_start_ends_at_the_warm_up_or_is_refused(start: float, rng: np.random.Generator):
+    """3 deg/h decaying in 3600 s, white noise of 0.05 deg/h a sample, from starts far on either side."""
+    time = 60.0 * np.arange(400)
+    output = 3.0 * np.exp(-time / 3600.0) + 0.05 * rng.standard_normal(len(time))
+    log = Campaign({"time": time, "output": output}, {"time": "s", "output": "deg/h"}, {"kind": "rate"})
+    model = GyroModel((BiasWarmup(time_constant=jnp.asarray(start)),), {"noise_white": 0.05 * DEG_H * np.sqrt(60.0)})
+    try:
+        found = fit(log, model)
+    except EstimateError:
+        return
+    assert found.table()[1].value == pytest.approx(3600.0, abs=100.0)
 
 
 def test_too_few_samples_are_refused(rng: np.random.Generator):

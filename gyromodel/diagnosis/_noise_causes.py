@@ -22,10 +22,11 @@ from gyromodel.units import factor
 STRETCH = 16
 # Quantisation variances over white ones that are tried.
 SHARES = np.geomspace(1e-3, 1e3, 61)
-# Power at one frequency beyond so many times the median is a line's: noise alone exceeds it once in 10⁵ frequencies.
-LINE = 42.0
-# Of the power that a spectrum leads one to expect, this many times it are rare; that there are too many of them.
-RARE_POWER, TOO_MANY = 6.6, 1e-3
+# Times the variance that a line has at its frequency, parts of the frequencies that may be lines, turns of their fit.
+LINE, LINES, TURNS = 20.0, (1e-6, 0.01, 0.03, 0.1), 20
+# Where a band may begin, in the units of quantisation's spectrum (0.1 to 0.45 times the sample rate), and by how much.
+EDGES, RAISED = 2.0 - 2.0 * np.cos(2.0 * np.pi * np.linspace(0.1, 0.45, 8)), np.geomspace(0.1, 300.0, 16)
+CHI_MEDIAN = float(stats.chi2.median(1))
 # A record with fewer hops than this has steps, each with an epoch of its own; fewer rows show no hops.
 FEWEST_HOPS, FEWEST_ROWS = 4, 100
 # Lead (nats) over coloured noise and steps from which hops are told.
@@ -39,8 +40,9 @@ MOST_HOPS = -1.1
 BOUNDS = ((-4.0, 4.0), (-6.0, 2.0), (-6.0, 1.0), (-12.0, MOST_HOPS), (-12.0, MOST_HOPS))
 # Levels closer than so many steps of the output are those of the readout.
 FEWEST_STEPS = 2.0
-# Columns that number what was done, and the share of hops at their changes from which on the gyro does not hop.
-NUMBERS, AT_CHANGES = ("position", "segment", "run"), 0.5
+# Columns that number what was done; the gyro does not hop where more than this share of hops is at their changes, and
+# that is rare by chance.
+NUMBERS, AT_CHANGES, BY_CHANCE = ("position", "segment", "run"), 0.5, 1e-3
 
 
 def as_cause(name: str, evidence: float, *sizes: ParameterValue) -> Cause:
@@ -61,20 +63,17 @@ def quantisation(estimate: Estimate, threshold: float) -> Cause | None:
     if not stretches:
         return None
     power = np.concatenate([np.square(np.asarray(dst(e, type=1, norm="ortho"))) for e in stretches])
-    # Steady lines are no quantisation, however fast.
-    power = np.minimum(power, LINE * np.median(power))
     spectrum = np.concatenate([2.0 - 2.0 * np.cos(np.pi * np.arange(1, len(e) + 1) / (len(e) + 1)) for e in stretches])
-    variance = 1.0 + SHARES[:, None] * spectrum
-    white = (power / variance).mean(1)
-    gain = -0.5 * np.log(variance).sum(1) - 0.5 * len(power) * np.log(white / power.mean())
-    evidence = log_sum(gain) - np.log(len(SHARES))
+    white, likelihood = _spectral_fit(power, 1.0 + np.append(0.0, SHARES)[:, None] * spectrum)
+    evidence = log_sum(likelihood[1:]) - likelihood[0] - np.log(len(SHARES))
     if evidence < threshold:
         return None
-    # Many weak lines raise some frequencies; quantisation raises all of its spectrum.
-    best = int(np.argmax(gain))
-    high = int(np.sum(power > RARE_POWER * variance[best] * white[best]))
-    if stats.binom.sf(high - 1, len(power), stats.chi2.sf(RARE_POWER, 1)) < TOO_MANY:
+    # Many weak lines, or noise of a band, raise the spectrum from some frequency on.
+    band = spectrum >= EDGES[:, None]
+    other = _spectral_fit(power, 1.0 + (RAISED[:, None, None] * band).reshape(-1, len(power)))[1]
+    if log_sum(other) - np.log(len(other)) > likelihood[0] + evidence:
         return None
+    white, gain = white[1:], likelihood[1:]
     weight = np.exp(gain - log_sum(gain))
     unit = record.interval * np.sqrt(estimate.white_variance) / abs(float(estimate.model.gain()))
     sizes = unit * np.sqrt(SHARES * white)
@@ -118,7 +117,9 @@ def telegraph(baseline: Estimate, extended: Estimate, unit: str) -> Cause | None
     size, step = 2.0 * np.exp(half) * spread, quantum(np.asarray(record.signals["output"])[: record.rows][here])
     if hops < FEWEST_HOPS or max(up, down) > MOST_HOPS - 0.01 or (step is not None and size < FEWEST_STEPS * step):
         return None
-    if np.mean(_change(record)[here][changed]) > AT_CHANGES:
+    near = _change(record)[here]
+    at_changes = int(near[changed].sum())
+    if at_changes > AT_CHANGES * hops and stats.binom.sf(at_changes - 1, hops, near.mean()) < BY_CHANCE:
         return None
     # Both in nats of the same samples; every free number of each costs half of ln n.
     other = _normal(extended, spread)
@@ -141,6 +142,31 @@ def telegraph(baseline: Estimate, extended: Estimate, unit: str) -> Cause | None
         ),
     )
     return cause if scatter >= IRREGULAR else replace(cause, posterior=0.5)
+
+
+def _spectral_fit(power: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Level and log likelihood of each shape of a spectrum, of which a part of the frequencies are lines.
+
+    Normal coefficients of variance level · shape, or LINE times that where there is a line; by that algorithm which
+    weighs each frequency by how likely it has none (Dempster, Laird, Rubin 1977).
+    """
+    part = power / variance
+    level, best = part.mean(1), np.full(len(part), -np.inf)
+    levels = level
+    for lines in LINES:
+        level = np.maximum(np.median(part, axis=1) / CHI_MEDIAN, 1e-300)
+        for _ in range(TURNS):
+            each = part / level[:, None]
+            odds = lines / (1.0 - lines) / np.sqrt(LINE) * np.exp(np.minimum(0.5 * each * (1.0 - 1.0 / LINE), 700.0))
+            quiet = 1.0 / (1.0 + odds)
+            level = np.mean(part * (quiet + (1.0 - quiet) / LINE), axis=1)
+        each = part / level[:, None]
+        odds = lines / (1.0 - lines) / np.sqrt(LINE) * np.exp(np.minimum(0.5 * each * (1.0 - 1.0 / LINE), 700.0))
+        value = np.sum(np.log1p(odds) - 0.5 * each, axis=1) + len(power) * np.log(1.0 - lines)
+        value -= 0.5 * (np.log(variance).sum(1) + len(power) * np.log(level))
+        levels = np.where(value > best, level, levels)
+        best = np.maximum(best, value)
+    return levels, best
 
 
 def _stretch(record: Record) -> np.ndarray:

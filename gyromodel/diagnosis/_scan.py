@@ -31,6 +31,9 @@ THREADS = 2
 # Lines whose interpolated statistic, were it this much larger, would not pay for the search are left interpolated.
 PEAK_SLACK = 1.5
 NO_LINES = np.zeros(0)
+# Further gross errors that are given up with the greatest: evidence of each alone (nats), the search over rows paid
+# for, and rows to the next, as errors side by side share theirs.
+ERROR_MARGIN, ERROR_DISTANCE = 8.0, 3
 # Records this short are test points, each of which may be anomalous; longer ones are series with single gross errors.
 TEST_POINTS = 40
 
@@ -287,6 +290,8 @@ class Scanner:
         keep = left > VANISHED * own
         t = np.where(keep, 1.0 / np.where(keep, left, 1.0), 0.0)[:, None] * b**2
         self._record(batch, name, where, t, np.where(keep, left, 0.0), 1, nu)
+        if name == "outliers" and t.shape[1] == 1 and len(where):
+            batch.best[name][0][0] = tuple(int(where[i]) for i in _gross(t[:, 0], where, batch.rss[0], nu))
 
     def _test_points(self, batch: Batch, cell: Cell, zj: np.ndarray, zy: np.ndarray, rows: np.ndarray, nu: int) -> None:
         """Sets of anomalous points, up to a third of all: in the order of a robust fit, priced by their number."""
@@ -366,3 +371,20 @@ class Scanner:
         batch.evidence[name] = evidence
         batch.best[name] = (list(where[top]), best, np.full(len(top), float(q)))
         batch.energy[name] = energy
+
+
+def _gross(t: np.ndarray, where: np.ndarray, rss: float, nu: int) -> list[int]:
+    """The greatest of many gross errors and, after it, each that is certain once those before it are given up."""
+    order = np.argsort(-t)
+    chosen, left = [int(order[0])], float(rss - t[order[0]])
+    for i in order[1:]:
+        if np.abs(where[chosen] - where[i]).min() < ERROR_DISTANCE:
+            continue
+        if not 0.0 < t[i] < left:
+            break
+        alone = log_evidence_ratio(t[[i]], left, nu - len(chosen), 1)[0] - np.log(len(t))
+        if alone < ERROR_MARGIN:
+            break
+        chosen.append(int(i))
+        left -= float(t[i])
+    return chosen

@@ -33,6 +33,8 @@ from gyromodel.units import factor
 CREDIBLE = 0.95
 # Where the noise has a random walk even with them, these have no edge that a walk could not make, whatever their lead.
 NO_EDGE = ("bias_drift", "bias_warmup")
+# Gross errors that are listed by row.
+ROWS_TOLD = 12
 # A driver that names leave with more than this share of the structure makes the discrepancy unknown.
 UNKNOWN_SHARE = 0.05
 
@@ -104,6 +106,11 @@ def judge(
     found = list(selection.found)
     runs = scanner.runs
     causes, sets, findings = [], [], []
+    given_up = sorted(row for step in found if step.name == "outliers" for row in step.rows)
+    if given_up and not scanner.by_points:
+        some = ", ".join(str(row + 1) for row in given_up[:ROWS_TOLD]) + ("…" if len(given_up) > ROWS_TOLD else "")
+        what = f"{len(given_up)} gross errors in data rows" if len(given_up) > 1 else "A gross error in data row"
+        findings.append(f"{what} {some}: given up, not modelled.")
     for i, step in enumerate(found):
         ranking, name = selection.left_out.get(i), step.name
         if ranking is None and len(found) > 1 and not uncontested(step):
@@ -120,8 +127,6 @@ def judge(
             if scanner.by_points and _unrepeated(record, step.rows):
                 members = {k: 0.5 * share for k, share in members.items()} | {"scale_spline": 0.5}
             elif not scanner.by_points:
-                some = ", ".join(str(r + 1) for r in step.rows[:8])
-                findings.append(f"Gross error in data row {some}: given up, not modelled.")
                 continue
         if name in baseline.model.wholly_fixed():
             findings.append(f"{name} is fixed in the simulation at a value that the data contradict: it was set free.")

@@ -278,6 +278,13 @@ def _finish(
             "give start values near the solution, or fix some parameters"
         )
     model = model.with_vector(jnp.asarray(solution.x))
+    for effect in model.effects:
+        try:
+            replace(effect)
+        except ValueError as problem:
+            raise EstimateError(
+                f"the fit left what {effect.label} can be ({problem}): give start values nearer the solution"
+            ) from None
     ordinary = variance is not None
     predicted, jacobian = model.linearise(record.signals)
     output, present = record.signals["output"], record.sampling.present

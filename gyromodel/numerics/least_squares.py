@@ -16,6 +16,8 @@ Normal = tuple[np.ndarray, np.ndarray, float]
 
 # Damping relative to the squared column norms: what a singular matrix needs, and what the first refused step gets.
 LEAST_DAMPING, FIRST_DAMPING = 1e-14, 1e-3
+# Times the tolerance by which the last refused step at a kink may be above it.
+KINK_TOLERANCE = 10.0
 
 
 class Solution(NamedTuple):
@@ -48,7 +50,7 @@ def levenberg_marquardt(
     a, g, cost = normal(x)
     if not _finite(a, g, cost):
         return Solution(x, cost, 0, False)
-    scale, growth = np.zeros(len(x)), 2.0
+    scale, growth, worse = np.zeros(len(x)), 2.0, np.inf
     for iteration in range(1, maximum_iterations + 1):
         scale = np.maximum(scale, np.sqrt(np.maximum(np.diag(a), 1e-300)))
         try:
@@ -60,9 +62,11 @@ def levenberg_marquardt(
         promise = -float(g @ step)
         if promise <= tolerance * cost:
             # Under heavy damping a small promise says nothing: then the residual must be orthogonal to every column, or
-            # every shorter step must have been refused, as where the sum of squares has a kink.
+            # the last step, so short that it cost next to nothing, still led up, as where the cost has a kink.
             orthogonal = np.all(np.abs(g) <= 1e-6 * scale * np.sqrt(cost))
-            return Solution(x, cost, iteration, bool(damping < 1.0 or growth > 2.0 or orthogonal))
+            return Solution(
+                x, cost, iteration, bool(damping < 1.0 or orthogonal or worse <= KINK_TOLERANCE * tolerance * cost)
+            )
         a_new, g_new, cost_new = normal(x + step)
         if _finite(a_new, g_new, cost_new) and cost_new <= cost:
             decrease = cost - cost_new
@@ -74,8 +78,9 @@ def levenberg_marquardt(
             damping = max(damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), LEAST_DAMPING)
             if ratio < 0.25:
                 damping = max(damping, FIRST_DAMPING)
-            growth = 2.0
+            growth, worse = 2.0, np.inf
         else:
+            worse = cost_new - cost if np.isfinite(cost_new) else np.inf
             damping, growth = max(growth * damping, FIRST_DAMPING), 2.0 * growth
     return Solution(x, cost, maximum_iterations, False)
 

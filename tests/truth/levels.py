@@ -41,9 +41,14 @@ class Level:
         return float(low), float(high)
 
     @property
-    def met(self) -> bool:
-        """The interval does not exclude the level."""
-        return self.interval[1] >= self.must if self.at_least else self.interval[0] <= self.must
+    def verdict(self) -> str:
+        """ "met" by the share itself; "open" where it is not, but the interval does not exclude the level; or "missed"."""
+        low, high = self.interval
+        if not self.total:
+            return "not measured"
+        if self.share >= self.must if self.at_least else self.share <= self.must:
+            return "met"
+        return "open" if (high >= self.must if self.at_least else low <= self.must) else "missed"
 
     @property
     def plausible(self) -> bool:
