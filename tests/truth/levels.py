@@ -42,7 +42,7 @@ class Level:
 
     @property
     def verdict(self) -> str:
-        """ "met" by the share itself; "open" where it is not, but the interval does not exclude the level; or "missed"."""
+        """Met by the share itself, open where it is not but the interval does not exclude the level, or missed."""
         low, high = self.interval
         if not self.total:
             return "not measured"
