@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -25,7 +25,7 @@ Scalar = Float[Array, ""]
 Response = Complex[Array, " frequency"]
 
 
-def value(default: float) -> Scalar:
+def value(default: float) -> Any:
     """A number that fits may change."""
     return eqx.field(converter=partial(jnp.asarray, dtype=float), default=default)
 
@@ -91,8 +91,8 @@ def measured_response(
 ) -> Response:
     """Ratio of the base angle that the platform measures to the table angle.
 
-    The gimbals read θ_b − θ_p. Navigation adds what it knows of θ_p: nothing where it takes the body for still but for a
-    slow drift, G_fog θ_p where it integrates the gyros. So the ratio is
+    The gimbals read θ_b − θ_p. Navigation adds what it knows of θ_p: nothing where it takes the body for still but for
+    a slow drift, G_fog θ_p where it integrates the gyros. So the ratio is
 
         e^(−sδ) · (1 + d' s)/(1 + d s + s²/ω_n²) · [1 − (1 − G_fog integrated) θ_p/θ_b],   d' = d (1 − grounded).
 

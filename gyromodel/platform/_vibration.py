@@ -1,7 +1,7 @@
 """Amplitude and phase of an angular vibration: base angle against table angle.
 
-Source of the correlation method: Zhang, Jiang, Jing and Wang, doi:10.19306/j.cnki.2095-8110.2022.06.009, 2022, equations
-(8)-(29); x is the base angle and y the table angle. Beside it, the maximum-likelihood fit of both sines.
+Source of the correlation method: Zhang, Jiang, Jing and Wang, doi:10.19306/j.cnki.2095-8110.2022.06.009, 2022,
+equations (8)-(29); x is the base angle and y the table angle. Beside it, the maximum-likelihood fit of both sines.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ DECIBELS = 20 / math.log(10.0)
 ROUNDING = 1e-12
 # Frequencies tried on either side of the nominal one, in quarters of 2π over the length of the record.
 TRIED = 16
-# Gauss-Newton steps of the frequency: each multiplies the error of the one before by a part in the signal-to-noise ratio.
+# Gauss-Newton steps of the frequency: each leaves of its error about the noise over the amplitude.
 STEPS = 12
 
 
