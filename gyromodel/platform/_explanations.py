@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -39,7 +39,7 @@ class Alternative(NamedTuple):
     """
 
     kinds: tuple[str, ...]
-    loop: Mapping[str, float] = MappingProxyType({})
+    loop: Mapping[str, Any] = MappingProxyType({})
     grounded: float = 0.0
 
     @property
@@ -168,7 +168,7 @@ def separation(
     n = len(at.axis)
     sign = np.arange(n) >= (0 if signed else len(before.axis))
     data = _data(truth.alternative, at, sign, np.eye(len(ENTRIES)))
-    predicted = np.asarray(_predict(jnp.asarray(truth.value), data))
+    predicted = np.asarray(_predicted(jnp.asarray(truth.value), data))
     std = np.repeat(truth.scatter, n)
     # Of one unknown factor, which does not change the fit: no test of whether its size is probable.
     found, _ = _physical(rival, at, predicted, sign, std, np.zeros(2 * n, int))
@@ -179,10 +179,7 @@ class _Data(NamedTuple):
     """What predictions need besides the parameters."""
 
     columns: Float[Array, "entry parameter"]
-    axis: Int[Array, " point"]
-    frequency: Float[Array, " point"]
-    amplifier: Float[Array, " point"]
-    integrated: Float[Array, " point"]
+    at: Any
     signed: Float[Array, " point"]
     loop: Loop
     grounded: Float[Array, ""]
@@ -190,8 +187,8 @@ class _Data(NamedTuple):
 
 def _data(alternative: Alternative, at: Points, signed: bool | np.ndarray, columns: np.ndarray) -> _Data:
     sign = np.broadcast_to(np.asarray(signed, float), at.frequency.shape)
-    arrays = (jnp.asarray(x) for x in (columns, *at, sign))
-    return _Data(*arrays, Loop(**alternative.loop), jnp.asarray(alternative.grounded))
+    at, arrays = jax.tree.map(jnp.asarray, (at, (columns, sign, alternative.grounded)))
+    return _Data(arrays[0], at, arrays[1], Loop(**alternative.loop), arrays[2])
 
 
 def _predict(parameters: Array, data: _Data) -> Array:
@@ -204,10 +201,13 @@ def _predict(parameters: Array, data: _Data) -> Array:
         mount = Mount(entry[:3][axis], entry[6:9][axis], entry[9], data.grounded)
         return measured_response(loop, mount, frequency[None], integrated)[0]
 
-    response = jax.vmap(one)(data.axis, data.frequency, data.amplifier, data.integrated)
+    response = jax.vmap(one)(*data.at)
     phase = jnp.rad2deg(jnp.angle(response))
     phase = jnp.where(data.signed > 0, phase, jnp.abs(phase))
     return jnp.concatenate([20 * jnp.log10(jnp.abs(response)), phase])
+
+
+_predicted = jax.jit(_predict)
 
 
 def _physical(

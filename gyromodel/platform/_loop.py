@@ -8,6 +8,7 @@ published: the defaults are a design whose crossover and whose closed-loop bandw
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -134,21 +135,27 @@ def margins(loop: Loop) -> Margins:
     grid = np.geomspace(LOWEST, HIGHEST, SEARCHED)
 
     def at(frequency: float) -> complex:
-        return complex(loop.open_loop(jnp.array([frequency]))[0])
+        return complex(_open_loop(loop, jnp.array([frequency]))[0])
 
-    response = np.asarray(loop.open_loop(jnp.asarray(grid)))
+    response = np.asarray(_open_loop(loop, jnp.asarray(grid)))
     crossover = _falls(lambda w: abs(at(w)) - 1, grid, np.abs(response) - 1, "|L| = 1")
     closed = np.abs(response / (1 + response)) - math.sqrt(0.5)
     bandwidth = _falls(lambda w: abs(at(w) / (1 + at(w))) - math.sqrt(0.5), grid, closed, "|L/(1 + L)| = −3 dB")
     # −L has the phase zero where that of L is −180°; below, the imaginary part of L is negative, as −90° is.
-    turning = _falls(lambda w: -at(w).imag, grid, np.where(response.real < 0, -response.imag, 1.0), "phase −180°")
+    turning = _falls(
+        lambda w: -at(w).imag, grid, np.where(np.real(response) < 0, -np.imag(response), 1.0), "phase −180°"
+    )
     phase = 180 + math.degrees(math.atan2(at(crossover).imag, at(crossover).real))
     return Margins(crossover, bandwidth, phase - 360 * (phase > 180), -20 * math.log10(abs(at(turning))))
 
 
-def _falls(function, grid: np.ndarray, values: np.ndarray, what: str) -> float:
+_open_loop = jax.jit(Loop.open_loop)
+
+
+def _falls(function: Callable[[float], float], grid: np.ndarray, values: np.ndarray, what: str) -> float:
     """The lowest frequency at which a function goes from positive to negative."""
     place = np.flatnonzero((values[:-1] > 0) & (values[1:] <= 0))
     if not len(place):
         raise ValueError(f"the loop has no {what} between {LOWEST:g} and {HIGHEST:g} rad/s: it is not that of figure 2")
-    return float(brentq(function, grid[place[0]], grid[place[0] + 1], xtol=1e-9))
+    root: Any = brentq(function, grid[place[0]], grid[place[0] + 1], xtol=1e-9)
+    return float(root)

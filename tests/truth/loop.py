@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.signal import StateSpace, lsim, tf2ss
 
-STEP = 5e-5
+STEP, SETTLING = 1e-4, 1.2
 
 
 def equations(
@@ -56,12 +56,20 @@ def equations(
 
 def ratio(system: StateSpace, frequency: float, time_offset: float = 0.0, integrated: float = 0.0) -> complex:
     """Measured base angle over table angle once it has settled: gimbal angle, and the gyro's integral."""
-    time = np.arange(int((1.5 + 2 * 2 * np.pi / frequency) / STEP)) * STEP
+    time = np.arange(int((SETTLING + 2 * 2 * np.pi / frequency) / STEP)) * STEP
     table = np.stack([np.sin(frequency * time), frequency * np.cos(frequency * time)], 1)
     _, angles, _ = lsim(system, table, time)
     measured = angles[:, 0] - angles[:, 1] + integrated * angles[:, 2]
-    settled = time > 1.5
+    settled = time > SETTLING
     stamp = time[settled] + time_offset
     columns = np.stack([np.sin(frequency * stamp), np.cos(frequency * stamp), np.ones(len(stamp))], 1)
     sine, cosine, _ = np.linalg.lstsq(columns, measured[settled], rcond=None)[0]
     return complex(sine, cosine)
+
+
+def settled_ratio(system: StateSpace, frequency: float, time_offset: float = 0.0) -> complex:
+    """The same without its transient, by solving the equations at one frequency."""
+    s = 1j * frequency
+    states = np.linalg.solve(s * np.eye(len(system.A)) - system.A, system.B @ np.array([1.0, s]))
+    angles = system.C @ states
+    return complex((angles[0] - angles[1]) * np.exp(-s * time_offset))
