@@ -26,7 +26,7 @@ LEADING = (
     "time offset, friction, double integration",
     "friction, resonance, quick integration",
 )
-FURTHER = (40.0, 50.0, 60.0, 80.0, 100.0)
+FURTHER = (40.0, 60.0, 80.0, 100.0, 140.0)
 TOLD_APART = 3.3
 
 
@@ -91,9 +91,8 @@ def table_of_explanations() -> tuple[list[list[str]], dict[str, Any]]:
     same = explanations(None)
     growing = explanations(np.tile((1 + FREQUENCIES) / 10, 3))
     best = [min(e.criterion for e in group.values()) for group in (same, growing)]
-    rows = []
+    rows, inertia = [], float(Loop().inertia)
     for name, e in sorted(same.items(), key=lambda item: item[1].criterion):
-        inertia = float(Loop().inertia)
         rows.append(
             [
                 name,
@@ -133,8 +132,8 @@ def limits(scatter: np.ndarray) -> list[list[str]]:
 
     from gyromodel.platform import FREQUENCIES, PRINTED_GAIN, PRINTED_PHASE, judge_gain, judge_phase
 
-    # The scatter of eleven to fifteen degrees of freedom, all told.
-    half = student.ppf(0.975, 10) * scatter
+    # Gains and phases have at least eight degrees of freedom each beside what an explanation takes.
+    half = student.ppf(0.975, 8) * scatter
     gain = judge_gain(PRINTED_GAIN - half[0], PRINTED_GAIN + half[0])
     phase = judge_phase(-PRINTED_PHASE - half[1], -PRINTED_PHASE + half[1])
     return [

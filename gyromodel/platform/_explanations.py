@@ -69,7 +69,7 @@ ALTERNATIVES = {
     "time offset, friction, double integration": Alternative(("offset", "friction"), DOUBLE),
     "friction, resonance": Alternative(("friction", "compliance")),
     "friction, resonance, quick integration": Alternative(("friction", "compliance"), QUICK),
-    "time offset, friction, resonance, quick integration": Alternative(("offset", "friction", "compliance"), QUICK),
+    "time offset, friction, resonance": Alternative(("offset", "friction", "compliance")),
 }
 
 

@@ -142,9 +142,8 @@ def margins(loop: Loop) -> Margins:
     closed = np.abs(response / (1 + response)) - math.sqrt(0.5)
     bandwidth = _falls(lambda w: abs(at(w) / (1 + at(w))) - math.sqrt(0.5), grid, closed, "|L/(1 + L)| = −3 dB")
     # −L has the phase zero where that of L is −180°; below, the imaginary part of L is negative, as −90° is.
-    turning = _falls(
-        lambda w: -at(w).imag, grid, np.where(np.real(response) < 0, -np.imag(response), 1.0), "phase −180°"
-    )
+    below = np.where(np.real(response) < 0, -np.imag(response), 1.0)
+    turning = _falls(lambda w: -at(w).imag, grid, below, "phase −180°")
     phase = 180 + math.degrees(math.atan2(at(crossover).imag, at(crossover).real))
     return Margins(crossover, bandwidth, phase - 360 * (phase > 180), -20 * math.log10(abs(at(turning))))
 
