@@ -1,21 +1,37 @@
-"""A stabilised platform: the Earth it is over, and its navigation from gyros and accelerometers."""
+"""A stabilised platform: the Earth it is over, and its navigation from gyros and accelerometers, its gimbals."""
 
 from gyromodel.platform._drift import residual_drift
 from gyromodel.platform._earth import EARTH_RATE, earth_rate, gravity, radii, transport_rate
+from gyromodel.platform._gimbals import (
+    GimbalErrors,
+    base_angles,
+    euler_angles,
+    euler_attitude,
+    gimbal_attitude,
+    least_motion_gimbals,
+    nulled_gimbals,
+)
 from gyromodel.platform._increments import coning, integrals, sculling
 from gyromodel.platform._navigation import Navigation, attitudes, navigate
 from gyromodel.platform._sensitivity import attitude_sensitivity
 
 __all__ = [
     "EARTH_RATE",
+    "GimbalErrors",
     "Navigation",
     "attitude_sensitivity",
     "attitudes",
+    "base_angles",
     "coning",
     "earth_rate",
+    "euler_angles",
+    "euler_attitude",
+    "gimbal_attitude",
     "gravity",
     "integrals",
+    "least_motion_gimbals",
     "navigate",
+    "nulled_gimbals",
     "radii",
     "residual_drift",
     "sculling",
