@@ -14,9 +14,11 @@ from gyromodel.platform._gimbals import (
 from gyromodel.platform._increments import coning, integrals, sculling
 from gyromodel.platform._navigation import Navigation, attitudes, navigate
 from gyromodel.platform._sensitivity import attitude_sensitivity
+from gyromodel.platform._simulation import Axis, simulate_axis
 
 __all__ = [
     "EARTH_RATE",
+    "Axis",
     "GimbalErrors",
     "Navigation",
     "attitude_sensitivity",
@@ -35,5 +37,6 @@ __all__ = [
     "radii",
     "residual_drift",
     "sculling",
+    "simulate_axis",
     "transport_rate",
 ]
