@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gyromodel.numerics.rotations import from_matrix, to_matrix
 from gyromodel.platform import (
     GimbalErrors,
     base_angles,
@@ -36,11 +35,11 @@ def rz(a: float) -> np.ndarray:
 
 
 def matrices(q: jax.Array) -> np.ndarray:
-    return np.asarray(to_matrix(q))
+    return Rotation.from_quat(np.asarray(q), scalar_first=True).as_matrix()
 
 
 def quaternions(matrix: np.ndarray) -> jax.Array:
-    return from_matrix(jnp.asarray(matrix))
+    return jnp.asarray(Rotation.from_matrix(matrix).as_quat(scalar_first=True))
 
 
 def angles_of(rng: np.random.Generator, columns: int) -> np.ndarray:

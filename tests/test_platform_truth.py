@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gyromodel.numerics.rotations import from_matrix, to_matrix
 from gyromodel.platform import Axis, GimbalErrors, Navigation, base_angles, navigate, simulate_axis
 from tests.truth import navigation, platform
 from tests.truth.platform import AXES, Loop, Platform
@@ -162,9 +161,11 @@ def chain(design: Platform, run: platform.Run, errors: GimbalErrors) -> np.ndarr
     earth = design.earth * np.array([np.cos(design.latitude), np.sin(design.latitude), 0.0])
     middle = run.time[:-1, None] + 0.5 * design.log
     force = Rotation.from_rotvec(middle * earth).apply([0.0, gravity, 0.0]) @ start
-    still = Navigation(from_matrix(jnp.asarray(start)), jnp.zeros(3), jnp.array([design.latitude, 0.0, 0.0]))
+    q = jnp.asarray(Rotation.from_matrix(start).as_quat(scalar_first=True))
+    still = Navigation(q, jnp.zeros(3), jnp.array([design.latitude, 0.0, 0.0]))
     history = navigate(still, jnp.zeros(force.shape), jnp.asarray(force * design.log), design.log)
-    assert np.abs(np.asarray(to_matrix(history.attitude)) - run.platform[0, 1:]).max() < QUANTUM / 6
+    attitude = Rotation.from_quat(np.asarray(history.attitude), scalar_first=True).as_matrix()
+    assert np.abs(attitude - run.platform[0, 1:]).max() < QUANTUM / 6
     return np.asarray(base_angles(history.attitude, jnp.asarray(run.gimbals[0, 1:]), jnp.eye(3), errors))
 
 
