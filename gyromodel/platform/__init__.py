@@ -2,13 +2,16 @@
 
 from gyromodel.platform._drift import residual_drift
 from gyromodel.platform._earth import EARTH_RATE, earth_rate, gravity, radii, transport_rate
+from gyromodel.platform._errors import Errors, NavigationError, navigation_error
 from gyromodel.platform._increments import coning, integrals, sculling
 from gyromodel.platform._navigation import Navigation, attitudes, navigate
 from gyromodel.platform._sensitivity import attitude_sensitivity
 
 __all__ = [
     "EARTH_RATE",
+    "Errors",
     "Navigation",
+    "NavigationError",
     "attitude_sensitivity",
     "attitudes",
     "coning",
@@ -16,6 +19,7 @@ __all__ = [
     "gravity",
     "integrals",
     "navigate",
+    "navigation_error",
     "radii",
     "residual_drift",
     "sculling",
