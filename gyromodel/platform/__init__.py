@@ -1,5 +1,6 @@
 """A stabilised platform: the Earth it is over, and its navigation from gyros and accelerometers."""
 
+from gyromodel.platform._campaign import navigate_campaign
 from gyromodel.platform._drift import residual_drift
 from gyromodel.platform._earth import EARTH_RATE, earth_rate, gravity, radii, transport_rate
 from gyromodel.platform._errors import Errors, NavigationError, navigation_error
@@ -19,6 +20,7 @@ __all__ = [
     "gravity",
     "integrals",
     "navigate",
+    "navigate_campaign",
     "navigation_error",
     "radii",
     "residual_drift",
