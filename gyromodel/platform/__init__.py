@@ -1,7 +1,9 @@
 """A stabilised platform: the Earth it is over, and its navigation from gyros and accelerometers, its gimbals."""
 
+from gyromodel.platform._campaign import navigate_campaign
 from gyromodel.platform._drift import residual_drift
 from gyromodel.platform._earth import EARTH_RATE, earth_rate, gravity, radii, transport_rate
+from gyromodel.platform._errors import Errors, NavigationError, navigation_error
 from gyromodel.platform._gimbals import (
     GimbalErrors,
     base_angles,
@@ -19,8 +21,10 @@ from gyromodel.platform._simulation import Axis, simulate_axis
 __all__ = [
     "EARTH_RATE",
     "Axis",
+    "Errors",
     "GimbalErrors",
     "Navigation",
+    "NavigationError",
     "attitude_sensitivity",
     "attitudes",
     "base_angles",
@@ -33,6 +37,8 @@ __all__ = [
     "integrals",
     "least_motion_gimbals",
     "navigate",
+    "navigate_campaign",
+    "navigation_error",
     "nulled_gimbals",
     "radii",
     "residual_drift",
