@@ -189,7 +189,7 @@ def fog_closed_loop_ramp(folder: Path) -> list[str]:
     def left(record: Record, *names: str) -> np.ndarray:
         """What the effects of some names leave, rad/s."""
         model = gyromodel.GyroModel(tuple(e for e in extended.effects if e.label in names))
-        return np.asarray(record.signals["output"] - model.predict(record.signals))[record.present]
+        return np.asarray(record.signals["output"] - model.predict(record.signals))[: record.rows][record.present]
 
     everything = read_signals(whole)
     mains = _with_double_mains(left(everything, "bias", "bias_readout_code"), whole.columns["time"], first)

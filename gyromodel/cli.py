@@ -267,6 +267,28 @@ def compensate(
 
 
 @app.command()
+def navigate(
+    campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Three gyros, accelerometers, first attitude.")],
+    output: CampaignFile,
+    as_json: AsJson = False,
+) -> None:
+    """Navigate from a start at rest: add attitude, velocity and position to a campaign."""
+    refuse_overwriting(output, [campaign])
+    from gyromodel.files import write_campaign
+    from gyromodel.platform import navigate_campaign
+
+    navigated = navigate_campaign(read_campaigns([campaign], None)[0])
+    output.parent.mkdir(parents=True, exist_ok=True)
+    write_campaign(navigated, output)
+    end = {name: float(navigated.columns[name][-1]) for name in ("latitude", "longitude", "height")}
+    if as_json:
+        print(json_text({"campaign": str(output), "rows": len(navigated), "end": end}), end="")
+        return
+    where = ", ".join(f"{name} {value:.6f}" for name, value in end.items())
+    print(f"{len(navigated)} samples in {output}; at the end {where} (deg, m)")
+
+
+@app.command()
 def export(
     model: Annotated[Path, typer.Argument(metavar="M.yaml", help="A model with values.")],
     to: Annotated[Literal["c", "json", "csv"], typer.Option("--to", help="C99 source, JSON, or CSV.")],

@@ -23,7 +23,7 @@ from gyromodel import _cache, _console, cli
 from gyromodel.campaign import Campaign
 from gyromodel.files import read_campaign, write_campaign
 
-COMMANDS = ("demo", "fit", "diagnose", "simulate", "compensate", "export", "allan", "effects")
+COMMANDS = ("demo", "fit", "diagnose", "simulate", "plan", "navigate", "compensate", "export", "allan", "effects")
 HEAVY = {"jax", "equinox", "numpy", "pandas", "pint", "matplotlib", "xarray", "scipy", "rich"}
 
 PLAN = """\

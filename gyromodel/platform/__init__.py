@@ -1,4 +1,4 @@
-"""A stabilised platform: the Earth it is over, and its navigation from gyros and accelerometers."""
+"""A stabilised platform: its navigation over the Earth, gimbals and stabilisation loop, and its angular vibration tests."""
 
 from gyromodel.platform._acceptance import (
     FREQUENCIES,
@@ -9,21 +9,25 @@ from gyromodel.platform._acceptance import (
     judge_gain,
     judge_phase,
 )
+from gyromodel.platform._campaign import navigate_campaign
 from gyromodel.platform._drift import residual_drift
 from gyromodel.platform._earth import EARTH_RATE, earth_rate, gravity, radii, transport_rate
-from gyromodel.platform._explanations import (
-    ALTERNATIVES,
-    Alternative,
-    Explanation,
-    Points,
-    explain,
-    points,
-    separation,
+from gyromodel.platform._errors import Errors, NavigationError, navigation_error
+from gyromodel.platform._explanations import ALTERNATIVES, Alternative, Explanation, Points, explain, points, separation
+from gyromodel.platform._gimbals import (
+    GimbalErrors,
+    base_angles,
+    euler_angles,
+    euler_attitude,
+    gimbal_attitude,
+    least_motion_gimbals,
+    nulled_gimbals,
 )
 from gyromodel.platform._increments import coning, integrals, sculling
 from gyromodel.platform._loop import Loop, Margins, Mount, margins, measured_response
 from gyromodel.platform._navigation import Navigation, attitudes, navigate
 from gyromodel.platform._sensitivity import attitude_sensitivity
+from gyromodel.platform._simulation import Axis, simulate_axis
 from gyromodel.platform._vibration import PublishedResponse, SineFit, fit_sines, published_response
 
 __all__ = [
@@ -35,32 +39,45 @@ __all__ = [
     "PRINTED_GAIN",
     "PRINTED_PHASE",
     "Alternative",
+    "Axis",
+    "Errors",
     "Explanation",
+    "GimbalErrors",
     "Loop",
     "Margins",
     "Mount",
     "Navigation",
+    "NavigationError",
     "Points",
     "PublishedResponse",
     "SineFit",
     "attitude_sensitivity",
     "attitudes",
+    "base_angles",
     "coning",
     "earth_rate",
+    "euler_angles",
+    "euler_attitude",
     "explain",
     "fit_sines",
+    "gimbal_attitude",
     "gravity",
     "integrals",
     "judge_gain",
     "judge_phase",
+    "least_motion_gimbals",
     "margins",
     "measured_response",
     "navigate",
+    "navigate_campaign",
+    "navigation_error",
+    "nulled_gimbals",
     "points",
     "published_response",
     "radii",
     "residual_drift",
     "sculling",
     "separation",
+    "simulate_axis",
     "transport_rate",
 ]

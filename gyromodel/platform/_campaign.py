@@ -1,0 +1,74 @@
+"""Navigation of a measured campaign: three gyros and three accelerometers on one body."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from gyromodel._checks import CampaignError
+from gyromodel.attitude import COLUMNS as ATTITUDE
+from gyromodel.campaign import AXES, Campaign
+from gyromodel.platform._increments import coning, integrals, sculling
+from gyromodel.platform._navigation import Navigation, navigate
+
+# Parts of a step by which sample times may be uneven: clocks that are read to a digit.
+EVEN = 0.02
+WRITTEN = {
+    "velocity_north": "m/s",
+    "velocity_up": "m/s",
+    "velocity_east": "m/s",
+    "latitude": "deg",
+    "longitude": "deg",
+    "height": "m",
+}
+
+
+def navigate_campaign(campaign: Campaign) -> Campaign:
+    """A campaign with the attitude, velocity and position at each of its samples, by inertial navigation alone.
+
+    Args:
+        campaign: at even times `output_x/_y/_z`, the rates of the body in inertial space (of a space-stabilised
+            platform: its residual drift), `acceleration_x/_y/_z`, the specific force, and `attitude_w/_x/_y/_z`, the
+            quaternion from body to north-up-east axes, of which only the first row is used; metadata `latitude_deg`
+            and, where they are not zero, `longitude_deg` and `height_m`. The body starts at rest over the Earth.
+
+    Returns:
+        The campaign with its attitude replaced and velocity and position added.
+
+    Raises:
+        CampaignError: something of that is missing, or samples are missing or uneven.
+    """
+    outputs, forces = ([f"{kind}_{axis}" for axis in AXES] for kind in ("output", "acceleration"))
+    needed = [*outputs, *forces, *ATTITUDE]
+    if missing := [name for name in needed if name not in campaign.columns]:
+        raise CampaignError(f"{campaign.name}: navigation needs columns {', '.join(missing)}")
+    if "latitude_deg" not in campaign.metadata:
+        raise CampaignError(f"{campaign.name}: navigation needs metadata latitude_deg, where the body starts")
+    time = campaign.si("time")
+    step = float(np.mean(np.diff(time)))
+    uneven = np.flatnonzero(np.abs(np.diff(time) - step) > EVEN * step)
+    if len(uneven):
+        raise CampaignError(f"{campaign.name}: navigation needs even times, and row {uneven[0] + 2} is off the rest")
+    rates, force = (
+        np.column_stack([campaign.in_unit(name, unit) for name in names])
+        for names, unit in ((outputs, "rad/s"), (forces, "m/s^2"))
+    )
+    start = np.array([campaign.columns[name][0] for name in ATTITUDE])
+    for values, names in ((rates, outputs), (force, forces), (start[None], ATTITUDE)):
+        row, column = np.nonzero(~np.isfinite(values))
+        if len(row):
+            raise CampaignError(f"{campaign.name}: {names[column[0]]} is missing in row {row[0] + 1}")
+    if abs(np.linalg.norm(start) - 1.0) > 0.01:
+        raise CampaignError(f"{campaign.name}: the attitude of row 1 is no unit quaternion")
+    place = [float(campaign.metadata.get(key, 0.0)) for key in ("latitude_deg", "longitude_deg", "height_m")]
+    position = np.array([*np.deg2rad(place[:2]), place[2]])
+    begin = Navigation(jnp.asarray(start / np.linalg.norm(start)), jnp.zeros(3), jnp.asarray(position))
+    angles, pushes = (integrals(jnp.asarray(samples), step) for samples in (rates, force))
+    made = navigate(begin, coning(angles), sculling(angles, pushes), step)
+    whole = [np.concatenate([np.asarray(a)[None], np.asarray(b)]) for a, b in zip(begin, made, strict=True)]
+    for name, values in zip(ATTITUDE, whole[0].T, strict=True):
+        campaign = campaign.with_column(name, values, "")
+    whole[2][:, :2] = np.rad2deg(whole[2][:, :2])
+    for (name, unit), values in zip(WRITTEN.items(), np.column_stack(whole[1:]).T, strict=True):
+        campaign = campaign.with_column(name, values, unit)
+    return campaign

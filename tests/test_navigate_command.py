@@ -1,0 +1,79 @@
+"""`gyromodel navigate`: closed forms of a body at rest and of one that turns about the vertical; what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gyromodel import cli
+from gyromodel.campaign import Campaign
+from gyromodel.files import read_campaign, write_campaign
+from tests.truth.navigation import OMEGA, normal_gravity
+
+ROWS, STEP, LATITUDE = 601, 0.1, 0.7
+START = Rotation.from_rotvec([0.3, -0.2, 1.1])
+
+
+def log(turning: float = 0.1) -> Campaign:
+    """A body that turns about the vertical (its own second axis at the start is anywhere), at rest over the Earth."""
+    time = np.arange(ROWS) * STEP
+    attitude = Rotation.from_rotvec(np.outer(turning * time, [0.0, 1.0, 0.0])) * START
+    rate = OMEGA * np.array([np.cos(LATITUDE), np.sin(LATITUDE), 0.0]) + np.array([0.0, turning, 0.0])
+    rates = attitude.inv().apply(rate)
+    forces = attitude.inv().apply([0.0, normal_gravity(LATITUDE, 50.0), 0.0])
+    columns = {"time": time}
+    columns |= {f"output_{a}": np.rad2deg(rates[:, i]) for i, a in enumerate("xyz")}
+    columns |= {f"acceleration_{a}": forces[:, i] for i, a in enumerate("xyz")}
+    columns |= dict(zip([f"attitude_{p}" for p in "xyzw"], np.tile(START.as_quat(), (ROWS, 1)).T, strict=True))
+    units = {name: "deg/s" if name.startswith("output") else "m/s^2" for name in columns} | {"time": "s"}
+    units |= dict.fromkeys([n for n in columns if n.startswith("attitude")], "")
+    return Campaign(columns, units, {"kind": "rate", "latitude_deg": np.rad2deg(LATITUDE), "height_m": 50.0})
+
+
+def navigated(campaign: Campaign, folder: Path) -> Campaign:
+    write_campaign(campaign, folder / "log.csv")
+    with pytest.raises(SystemExit) as done:
+        cli.main(["navigate", str(folder / "log.csv"), "-o", str(folder / "out" / "navigated.csv"), "--json"])
+    assert done.value.code == 0
+    return read_campaign(folder / "out" / "navigated.csv")
+
+
+@pytest.mark.parametrize("turning", [-0.1, 0.4])
+def test_a_body_over_one_place_stays_there(turning: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    made = navigated(log(turning), tmp_path)
+    # Files hold sixteen digits; the rates of a cone are integrated by a cubic.
+    assert np.abs([made.columns[f"velocity_{n}"] for n in ("north", "up", "east")]).max() < 2e-5
+    assert np.rad2deg(LATITUDE) == pytest.approx(made.columns["latitude"], abs=1e-8)
+    assert made.columns["height"] == pytest.approx(50.0, abs=1e-3)
+    end = Rotation.from_quat([made.columns[f"attitude_{p}"][-1] for p in "xyzw"])
+    expected = Rotation.from_rotvec([0.0, turning * STEP * (ROWS - 1), 0.0]) * START
+    assert (end * expected.inv()).magnitude() < 1e-6
+    assert json.loads(capsys.readouterr().out)["rows"] == ROWS
+
+
+@pytest.mark.parametrize(
+    ("broken", "said"),
+    [
+        (lambda c: c.without("acceleration_y"), "needs columns acceleration_y"),
+        (lambda c: c.with_metadata({"latitude_deg": None}), "latitude_deg"),
+        (lambda c: c.select(np.delete(np.arange(ROWS), 100)), "even times, and row 101"),
+        (
+            lambda c: c.with_column("output_z", np.where(np.arange(ROWS) == 7, np.nan, 0.1), "deg/s"),
+            "output_z is missing",
+        ),
+        (lambda c: c.with_column("attitude_w", np.full(ROWS, 3.0), ""), "no unit quaternion"),
+    ],
+)
+def test_what_cannot_be_navigated_is_refused(broken, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    write_campaign(broken(log()), tmp_path / "log.csv")
+    with pytest.raises(SystemExit) as done:
+        cli.main(["navigate", str(tmp_path / "log.csv"), "-o", str(tmp_path / "navigated.csv")])
+    assert done.value.code == 1
+    message = capsys.readouterr().err
+    assert said in message
+    assert message.count("\n") == 1
+    assert not (tmp_path / "navigated.csv").exists()
