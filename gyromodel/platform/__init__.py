@@ -1,4 +1,4 @@
-"""A stabilised platform: its navigation over the Earth, gimbals and stabilisation loop, and its angular vibration tests."""
+"""A stabilised platform: its navigation over the Earth, gimbals, stabilisation loop, and angular vibration tests."""
 
 from gyromodel.platform._acceptance import (
     FREQUENCIES,

@@ -165,8 +165,7 @@ def _project(time: jax.Array, drift: jax.Array, signals: jax.Array, harmonics: i
     angles = w * time[:, None] * orders
     columns = jnp.concatenate([jnp.sin(angles[:, :1]), jnp.cos(angles[:, :1]), drift], axis=1)
     columns = jnp.concatenate([columns, jnp.sin(angles[:, 1:]), jnp.cos(angles[:, 1:])], axis=1)
-    q, r = jnp.linalg.qr(columns)
-    inverse = jnp.linalg.inv(r)
+    q, inverse = _orthonormal(columns)
     coefficients = inverse @ (q.T @ signals)
     residual = signals - q @ (q.T @ signals)
     sines, cosines = (jnp.concatenate([coefficients[k : k + 1], more]) for k, more in
@@ -180,3 +179,19 @@ def _project(time: jax.Array, drift: jax.Array, signals: jax.Array, harmonics: i
     step = jnp.sum(jnp.sum(left * residual, axis=0) / squares) / jnp.sum(slopes / squares)
     by_frequency = -(inverse @ (q.T @ moved))[:2]
     return _Projected(coefficients[:2], (inverse @ inverse.T)[:2, :2], by_frequency, squares, slopes, step)
+
+
+def _orthonormal(columns: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Q = columns · T and T, triangular: Gram-Schmidt, each column twice.
+
+    Not by LAPACK, whose calls in a compiled loop over many records waited for one another for ever on two cores.
+    """
+    q, t = columns[:, :0], jnp.zeros((columns.shape[1], 0))
+    for column, own in zip(columns.T, jnp.eye(columns.shape[1]), strict=True):
+        for _ in range(2):
+            along = q.T @ column
+            column, own = column - q @ along, own - t @ along
+        norm = jnp.sqrt(column @ column)
+        q = jnp.concatenate([q, (column / norm)[:, None]], axis=1)
+        t = jnp.concatenate([t, (own / norm)[:, None]], axis=1)
+    return q, t
