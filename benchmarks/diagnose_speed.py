@@ -29,7 +29,7 @@ FLOOR = "one plain least-squares F scan of the same columns, numpy"
 # Stages of the work: the function that does each, by file and name.
 STAGES = (
     ("fits (`fit_record`)", "_fit.py", "fit_record"),
-    ("of which the noise search (`best_ratios`)", "_fit.py", "best_ratios"),
+    ("of which the noise search (`best_ratios`)", "_noise.py", "best_ratios"),
     ("bank of candidates (`build_bank`)", "_bank.py", "build_bank"),
     ("ranking (`rank`)", "_ranking.py", "rank"),
     ("of which noise cells (`Scanner.run`)", "_scan.py", "run"),

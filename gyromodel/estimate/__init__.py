@@ -10,9 +10,9 @@ from gyromodel.estimate._fit import (
     given_ratios,
     make_filter,
     whiten_columns,
-    with_noise_intervals,
 )
 from gyromodel.estimate._function import FunctionFit, fit_function
+from gyromodel.estimate._noise import with_noise_intervals
 from gyromodel.estimate._two_stage import two_stage
 
 __all__ = [

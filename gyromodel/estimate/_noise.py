@@ -1,0 +1,125 @@
+"""The noise of a fit: the cell of greatest restricted likelihood, and the range that a likelihood ratio leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gyromodel.estimate._estimate import Estimate, noise_coefficients
+from gyromodel.model import GyroModel, record_span
+from gyromodel.noise import NoiseRatios, markov_cells, noise_grid, restricted_likelihood
+from gyromodel.signals import Record
+
+# Factors (ln) on either side of the best noise ratios, tried one after the other: after the grid, and in later turns.
+COARSE_STEPS, FINE_STEPS = (0.8, 0.4, 0.2, 0.1), (0.7, 0.35, 0.17)
+# Noise is a Markov process rather than flicker and walk if it is so much likelier (nats).
+MARKOV_LEAD = 5.0
+# Levels of each noise ratio over its likely range, for the intervals of the noise coefficients.
+INTERVAL_LEVELS = 16
+# Half the 95 % point of chi-squared with one degree of freedom.
+REJECTED = 1.92
+
+
+def best_ratios(
+    record: Record, model: GyroModel, *, coarse: bool, start: NoiseRatios, markov: bool | None
+) -> NoiseRatios:
+    """The noise of greatest restricted likelihood: the grids, then ever finer squares around the best cell.
+
+    It is flicker and walk, unless a Markov process beside white noise is likelier by a margin.
+    """
+    predicted, jacobian = model.linearise(record.signals)
+    residual = np.where(record.sampling.present, np.asarray(record.signals["output"]) - predicted, 0.0)
+    span = record_span(record)
+
+    def likelihood(cells: NoiseRatios) -> np.ndarray:
+        args = (record.interval, span, record.sampling, jacobian, residual)
+        return restricted_likelihood(cells, *args).log_likelihood
+
+    best = start
+    if coarse:
+        grid = noise_grid(int(record.present.sum()), record.interval, span)
+        # Every other level, then the levels around the best of them.
+        levels = [np.unique(r) for r in grid.ratios]
+        first = _mesh(level[::2] for level in levels)
+        best = first.take(int(np.argmax(likelihood(first))))
+        near = _mesh(_around(level, float(r)) for level, r in zip(levels, best, strict=True))
+        best = near.take(int(np.argmax(likelihood(near))))
+    best, top = _refined(likelihood, best, COARSE_STEPS if coarse else FINE_STEPS)
+    if not coarse or markov is False:
+        return best
+    cells = markov_cells(int(record.present.sum()), record.interval, span)
+    if not len(cells.flicker):
+        return best
+    other = cells.take(int(np.argmax(likelihood(cells))))
+    other, likeliest = _refined(likelihood, other, COARSE_STEPS)
+    return other if markov or likeliest > top + MARKOV_LEAD else best
+
+
+def _refined(
+    likelihood: Callable[[NoiseRatios], np.ndarray], best: NoiseRatios, steps: Sequence[float]
+) -> tuple[NoiseRatios, float]:
+    """The likeliest cell around one, and its log likelihood."""
+    top = -np.inf
+    for width in steps:
+        cells = _mesh(np.asarray(r) * np.exp(width * np.array([-1.0, 0.0, 1.0])) for r in best)
+        each = likelihood(cells)
+        best, top = cells.take(int(np.argmax(each))), float(each.max())
+    return best, top
+
+
+def _around(levels: np.ndarray, level: float) -> np.ndarray:
+    i = int(np.searchsorted(levels, level))
+    return levels[max(i - 1, 0) : i + 2]
+
+
+def _mesh(levels: Iterable[np.ndarray]) -> NoiseRatios:
+    """Cells at every combination of levels."""
+    return NoiseRatios(*(v.ravel() for v in np.meshgrid(*map(np.unique, levels), indexing="ij")))
+
+
+def settled(a: NoiseRatios, b: NoiseRatios) -> bool:
+    return all(abs(np.log((float(x) + 1e-300) / (float(y) + 1e-300))) < 0.05 for x, y in zip(a, b, strict=True))
+
+
+def with_noise_intervals(estimate: Estimate) -> Estimate:
+    """The estimate with 95 % intervals of its noise coefficients, where the noise was estimated.
+
+    They are the coefficients' ranges over the noise cells that a likelihood ratio does not reject.
+    """
+    if estimate.noise_given:
+        return estimate
+    record, gain = estimate.record, float(estimate.model.gain())
+    predicted, jacobian = estimate.model.linearise(record.signals)
+    residual = np.where(record.sampling.present, np.asarray(record.signals["output"]) - predicted, 0.0)
+    span = record_span(record)
+    samples = int(record.present.sum())
+    grid = noise_grid(samples, record.interval, span).ratios
+    if float(estimate.ratios.markov) > 0:
+        grid = markov_cells(samples, record.interval, span)
+    cells = _mesh(
+        np.union1d(r, float(b) * np.array([0.2, 1.0, 5.0])) for r, b in zip(grid, estimate.ratios, strict=True)
+    )
+    for margin in (4.0, 2.0, 2.0, 2.0, 0.0):
+        result = restricted_likelihood(cells, record.interval, span, record.sampling, jacobian, residual)
+        below = result.log_likelihood.max() - result.log_likelihood
+        kept = below < REJECTED
+        if not margin or kept.sum() > 2 * INTERVAL_LEVELS:
+            break
+        cells = _mesh(_levels(np.asarray(ratio), below < margin * REJECTED) for ratio in np.broadcast_arrays(*cells))
+    white = result.residual_sum[kept] / result.degrees_of_freedom
+    ratios = cells.take(kept)
+    spans = {k: (float(v.min()), float(v.max())) for k, v in noise_coefficients(ratios, white, record, gain).items()}
+    low, high = spans["noise_white"]
+    scatter = 1.96 / float(np.sqrt(2 * (record.present.sum() - 1)))
+    spans["noise_white"] = (low * (1 - scatter), high * (1 + scatter))
+    return replace(estimate, noise_interval=spans)
+
+
+def _levels(ratio: np.ndarray, likely: np.ndarray) -> np.ndarray:
+    """Levels of one noise ratio, even in amplitude, from the one below its likely range to the one above."""
+    levels = np.unique(ratio)
+    first, last = np.searchsorted(levels, [ratio[likely].min(), ratio[likely].max()])
+    low, high = levels[max(first - 1, 0)], levels[min(last + 1, len(levels) - 1)]
+    return np.linspace(np.sqrt(low), np.sqrt(high), INTERVAL_LEVELS) ** 2
