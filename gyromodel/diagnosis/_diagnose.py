@@ -141,14 +141,18 @@ def diagnose(
     grows = growing_noise(record, selection.estimate)
     if grows is not None:
         weighted = with_variance(record, grows.white)
-        alike = fit_record(weighted, model)
-        again = _Session(Scanner(weighted, bank, grid, stated=alike.noise_given), session.threshold)
-        other = again.run(alike, say)
-        if _unfinished(other):
-            # Structure that is left passes for a level that varies; without any left, the level passed for structure.
+        try:
+            alike = fit_record(weighted, model)
+        except EstimateError:
             grows = None
         else:
-            record, baseline, session, selection = weighted, alike, again, other
+            again = _Session(Scanner(weighted, bank, grid, stated=alike.noise_given), session.threshold)
+            other = again.run(alike, say)
+            if _unfinished(other):
+                # Structure that is left passes for a level that varies; without any left, the level passed for it.
+                grows = None
+            else:
+                record, baseline, session, selection = weighted, alike, again, other
     if grows is not None:
         times = max(grows.ratio, 1.0 / grows.ratio)
         findings.append(
