@@ -213,8 +213,10 @@ def _restore(columns: Mapping[str, Any], units: Mapping[str, str], metadata: Map
 
 
 def _check_usable(campaign: Campaign) -> None:
-    """What a model needs: an output of known kind that varies, in three rows or more."""
+    """What a model needs: an output of known kind that varies, or gimbal angles, in three rows or more."""
     outputs = campaign.outputs
+    if not outputs and len(campaign) >= 3 and any(name.startswith("gimbal_") for name in campaign.columns):
+        return  # a platform tells its attitude by its gimbals
     if not outputs:
         names = listed(campaign.columns)
         raise CampaignError(f"there is no column 'output' (or 'output_x', 'output_y', 'output_z'): found {names}")

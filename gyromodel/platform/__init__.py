@@ -25,6 +25,7 @@ from gyromodel.platform._gimbals import (
 )
 from gyromodel.platform._increments import coning, integrals, sculling
 from gyromodel.platform._loop import Loop, Margins, Mount, margins, measured_response
+from gyromodel.platform._motion import GIMBALS, TABLE, BaseMotion, base_motion, is_platform
 from gyromodel.platform._navigation import Navigation, attitudes, navigate
 from gyromodel.platform._sensitivity import attitude_sensitivity
 from gyromodel.platform._simulation import Axis, simulate_axis
@@ -35,11 +36,14 @@ __all__ = [
     "EARTH_RATE",
     "FREQUENCIES",
     "GAIN_LIMIT",
+    "GIMBALS",
     "PHASE_LIMIT",
     "PRINTED_GAIN",
     "PRINTED_PHASE",
+    "TABLE",
     "Alternative",
     "Axis",
+    "BaseMotion",
     "Errors",
     "Explanation",
     "GimbalErrors",
@@ -54,6 +58,7 @@ __all__ = [
     "attitude_sensitivity",
     "attitudes",
     "base_angles",
+    "base_motion",
     "coning",
     "earth_rate",
     "euler_angles",
@@ -63,6 +68,7 @@ __all__ = [
     "gimbal_attitude",
     "gravity",
     "integrals",
+    "is_platform",
     "judge_gain",
     "judge_phase",
     "least_motion_gimbals",
