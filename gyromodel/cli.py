@@ -289,6 +289,49 @@ def navigate(
 
 
 @app.command()
+def batch(
+    archive: Annotated[
+        str, typer.Argument(metavar="ARCHIVE", help="Folder, quoted pattern, Zarr group, or Parquet manifest.")
+    ],
+    model: ModelFile,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="RESULTS.parquet", help="The table to write.")],
+    diagnose: Annotated[bool, typer.Option("--diagnose", help="Diagnose each campaign rather than fit it.")] = False,
+    workers: Annotated[int, typer.Option(min=1, metavar="N", help="Processes of a local cluster.")] = 1,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="A Dask cluster, such as tcp://host:8786.", show_default=False)
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Fit every campaign of an archive into one table; killed, it goes on where it was.
+
+    A campaign that cannot be read or fitted is a row with its reason, and the exit status is then 1.
+    """
+    if output.suffix != ".parquet":
+        raise typer.BadParameter("the table is a Parquet file: end its name in .parquet", param_hint="--output")
+    refuse_overwriting(output, [model, Path(archive)])
+    from hashlib import sha256
+
+    from gyromodel.batch import run_batch
+    from gyromodel.model_files import read_model
+
+    start, digest = read_model(model), sha256(model.read_bytes()).hexdigest()
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with progress_bar() as progress:
+        done = run_batch(
+            archive, start, digest, output,
+            diagnosing=diagnose, workers=workers, scheduler=scheduler, progress=progress,
+        )  # fmt: skip
+    result = {"results": str(output), "campaigns": done.campaigns, "examined": done.examined, "failed": done.failed}
+    if as_json:
+        print(json_text(result), end="")
+    else:
+        print(f"{done.campaigns} campaigns, {done.examined} examined in this run; {len(done.table)} rows in {output}")
+    if done.failed:
+        print(f"gyromodel: {done.failed} of {done.campaigns} campaigns failed: see column reason", file=sys.stderr)
+        sys.exit(1)
+
+
+@app.command()
 def export(
     model: Annotated[Path, typer.Argument(metavar="M.yaml", help="A model with values.")],
     to: Annotated[Literal["c", "json", "csv"], typer.Option("--to", help="C99 source, JSON, or CSV.")],
