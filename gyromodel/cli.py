@@ -332,6 +332,41 @@ def batch(
 
 
 @app.command()
+def units(
+    results: Annotated[Path, typer.Argument(metavar="RESULTS.parquet", help="What batch has written.")],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="FILE.parquet", help="Campaigns' parameters as all units tell them."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Tell how the units of an archive spread, which stand out, and which drift."""
+    if output:
+        refuse_overwriting(output, [results])
+    from gyromodel.batch import pooled_table, read_results, unit_statistics
+    from gyromodel.batch import write_table as write
+
+    table = read_results(results)
+    found = unit_statistics(table)
+    if output:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        write(pooled_table(table, found), output)
+    if as_json:
+        print(json_text([statistics.to_dict() for statistics in found]), end="")
+        return
+    from gyromodel.report import with_uncertainty
+
+    rows = [
+        (f"{s.parameter}{' ' * bool(s.axis)}{s.axis}", str(s.units), str(s.campaigns),
+         with_uncertainty(s.mean, s.mean_std, s.unit), f"{s.between.value:.3g}", f"{s.within.value:.3g}")
+        for s in found
+    ]  # fmt: skip
+    print_table(("parameter", "units", "campaigns", "mean", "unit to unit", "campaign to campaign"), rows)
+    for line in (line for statistics in found for line in statistics.sentences()):
+        print(f"- {line}")
+
+
+@app.command()
 def export(
     model: Annotated[Path, typer.Argument(metavar="M.yaml", help="A model with values.")],
     to: Annotated[Literal["c", "json", "csv"], typer.Option("--to", help="C99 source, JSON, or CSV.")],

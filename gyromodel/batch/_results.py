@@ -23,7 +23,7 @@ SCHEMA = pa.schema(
     + [(name, pa.float64()) for name in ("value", "std", "low", "high")]
     + [(name, pa.string()) for name in ("unit", "status", "reason", "verdict", "causes")]
     + [("gain_ratio", pa.float64()), ("samples", pa.int64()), ("iterations", pa.int64())]
-    + [(name, pa.string()) for name in ("serial", "data_hash", "model_hash", "version", "file_state")]
+    + [(name, pa.string()) for name in ("serial", "date", "data_hash", "model_hash", "version", "file_state")]
 )
 # Seconds of finished work that a kill may cost.
 PART_EVERY = 1.0
@@ -96,7 +96,7 @@ class Results:
         """Write what waits as a part."""
         if self._waiting:
             table = self._table(self._waiting)
-            _write(table, self._folder / f"{self._next:08d}.parquet")
+            write_table(table, self._folder / f"{self._next:08d}.parquet")
             self._tables.append(table)
             self._waiting, self._next = [], self._next + 1
         self._written = time.monotonic()
@@ -116,7 +116,7 @@ class Results:
         whole = pa.concat_tables(kept)
         order_of = sorted(range(len(whole)), key=whole["_place"].to_pylist().__getitem__)
         whole = whole.take(order_of).drop_columns(["_place"])
-        _write(whole, self.path)
+        write_table(whole, self.path)
         shutil.rmtree(self._folder)
         return whole
 
@@ -124,13 +124,7 @@ class Results:
         return pa.Table.from_pylist(rows, SCHEMA).replace_schema_metadata({MADE_BY: json.dumps(self.made_by)})
 
     def _read(self, path: Path) -> pa.Table:
-        try:
-            with parquet.ParquetFile(path) as file:
-                table = file.read()
-        except (pa.ArrowException, OSError) as error:
-            raise CampaignError(f"{path}: exists and is no table of results: name another file") from error
-        if MADE_BY not in (table.schema.metadata or {}):
-            raise CampaignError(f"{path}: exists and is no table of results: name another file")
+        table = read_results(path)
         if (made_by := json.loads(table.schema.metadata[MADE_BY])) != self.made_by:
             other = " and ".join(sorted(k for k in self.made_by if made_by.get(k) != self.made_by[k]))
             raise CampaignError(f"{path}: holds results of another {other}: name another file, or remove this one")
@@ -143,7 +137,23 @@ class Results:
             return False
 
 
-def _write(table: pa.Table, path: Path) -> None:
+def read_results(path: Path) -> pa.Table:
+    """A table of results.
+
+    Raises:
+        CampaignError: it is none.
+    """
+    try:
+        with parquet.ParquetFile(path) as file:
+            table = file.read()
+    except (pa.ArrowException, OSError) as error:
+        raise CampaignError(f"{path}: is no table of results, or cannot be read") from error
+    if MADE_BY not in (table.schema.metadata or {}):
+        raise CampaignError(f"{path}: is no table of results")
+    return table
+
+
+def write_table(table: pa.Table, path: Path) -> None:
     """Whole or not at all, and on disk."""
     temporary = path.with_name(f".{path.name}.tmp")
     try:

@@ -7,12 +7,15 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pyarrow as pa
 
 import gyromodel
+from gyromodel._checks import CampaignError
 from gyromodel.batch._archive import Entry, entries
 from gyromodel.batch._results import Results
 from gyromodel.batch._work import Row, examine, failed, read
@@ -20,6 +23,8 @@ from gyromodel.model import GyroModel
 
 # Tasks that wait at each worker, so that none is idle, and times that a task may lose its worker.
 WAITING, LOST = 4, 3
+# Seconds in which a scheduler has to answer.
+PATIENCE = 10
 # Seconds over which the rate of work is averaged.
 RECENT = 60.0
 
@@ -107,39 +112,31 @@ def _on_cluster(tasks: Sequence[Task], workers: int, scheduler: str | None) -> I
     from dask.config import set as configured
     from distributed import Client, LocalCluster, as_completed
 
-    with configured({"distributed.scheduler.allowed-failures": LOST}):
-        cluster = (
-            LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address="", silence_logs=logging.CRITICAL)
-            if scheduler is None
-            else None
-        )
+    with configured({"distributed.scheduler.allowed-failures": LOST}), ExitStack() as open_ones:
+        if scheduler is None:
+            quiet = {"dashboard_address": "", "silence_logs": logging.CRITICAL}
+            cluster = open_ones.enter_context(LocalCluster(n_workers=workers, threads_per_worker=1, **quiet))
         try:
-            with Client(cluster or scheduler) as client:
-                waiting = iter(tasks)
-                of = {}
+            client = open_ones.enter_context(Client(scheduler or cluster, timeout=PATIENCE))
+        except OSError:
+            raise CampaignError(f"{scheduler}: no Dask scheduler answers there within {PATIENCE} s") from None
+        waiting, of = iter(tasks), {}
 
-                def submit() -> Any:
-                    task = next(waiting, None)
-                    if task is None:
-                        return None
-                    future = client.submit(examine, *task, pure=False)
-                    of[future.key] = task
-                    return future
+        def submitted(count: int) -> list[Any]:
+            new = {client.submit(examine, *task, pure=False): task for task in islice(waiting, count)}
+            of.update({future.key: task for future, task in new.items()})
+            return list(new)
 
-                ahead = WAITING * max(workers, len(client.scheduler_info()["workers"]))
-                running = as_completed([f for _ in range(ahead) if (f := submit()) is not None])
-                for future in running:
-                    entry, state, _, model_hash, _ = of.pop(future.key)
-                    if future.status == "finished":
-                        yield future.result()
-                    else:
-                        head = {"campaign": entry.campaign, "model_hash": model_hash, "file_state": state}
-                        yield [failed(head | {"version": gyromodel.__version__}, future.exception())]
-                    if (more := submit()) is not None:
-                        running.add(more)
-        finally:
-            if cluster is not None:
-                cluster.close()
+        ahead = WAITING * max(workers, len(client.scheduler_info()["workers"]))
+        running = as_completed(submitted(ahead))
+        for future in running:
+            entry, state, _, model_hash, _ = of.pop(future.key)
+            if future.status == "finished":
+                yield future.result()
+            else:
+                head = {"campaign": entry.campaign, "model_hash": model_hash, "file_state": state}
+                yield [failed(head | {"version": gyromodel.__version__}, future.exception())]
+            running.update(submitted(1))
 
 
 class _Pace:

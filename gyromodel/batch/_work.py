@@ -42,8 +42,7 @@ def examine(
     if isinstance(campaign, Exception):
         return [failed(head, campaign)]
     head["data_hash"] = campaign.digest()
-    if (serial := campaign.metadata.get("serial")) is not None:
-        head["serial"] = str(serial)
+    head |= {key: str(campaign.metadata[key]) for key in ("serial", "date") if key in campaign.metadata}
     if campaign.outputs in ((), ("output",)):
         return _rows(head, campaign, model, diagnosing)
     axes = [name.removeprefix("output_") for name in campaign.outputs]
