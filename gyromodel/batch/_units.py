@@ -15,6 +15,7 @@ import pandas as pd
 import pyarrow as pa
 from jaxtyping import Float, Int
 from scipy import stats
+from scipy.special import ndtr
 
 # Levels of each spread, and how far beyond the scatter of the estimates they reach.
 LEVELS, BEYOND = 40, 6.0
@@ -146,6 +147,7 @@ def _by_parameter(results: pa.Table) -> Iterator[_Rows]:
     frame["serial"] = frame["serial"].where(frame["serial"].notna(), frame["campaign"])
     frame["axis"] = frame["axis"].fillna("")
     for (parameter, axis, unit_text), part in frame.groupby(["parameter", "axis", "unit"], sort=False):
+        part = part.sort_values("serial", kind="stable")
         names, unit = np.unique(part["serial"].to_numpy(str), return_inverse=True)
         dates = pd.to_datetime(part["date"], errors="coerce", utc=True, format="ISO8601")
         yield _Rows(
@@ -183,17 +185,14 @@ def _posterior(value: np.ndarray, std: np.ndarray, unit: np.ndarray) -> _Posteri
 
 
 def _of_units(value: np.ndarray, std: np.ndarray, unit: np.ndarray, within: np.ndarray):
-    """Weighted mean of each unit's campaigns (unit by cell), its variance, ln likelihood of the scatter about it."""
+    """Weighted mean of each unit's campaigns (unit by cell), its variance, ln likelihood of the scatter about it.
+
+    Campaigns of one unit stand together.
+    """
     v = std[:, None] ** 2 + within**2
-    units = unit.max() + 1
-
-    def summed(x: np.ndarray) -> np.ndarray:
-        out = np.zeros((units, x.shape[1]))
-        np.add.at(out, unit, x)
-        return out
-
-    precision = summed(1 / v)
-    mean = summed(value[:, None] / v) / precision
+    first = np.flatnonzero(np.diff(unit, prepend=-1))
+    precision = np.add.reduceat(1 / v, first)
+    mean = np.add.reduceat(value[:, None] / v, first) / precision
     scatter = (value[:, None] - mean[unit]) ** 2 / v
     return mean, 1 / precision, -0.5 * (np.log(v) + scatter).sum(0) - 0.5 * np.log(precision).sum(0)
 
@@ -227,7 +226,7 @@ def _spread(levels: np.ndarray, weight: np.ndarray) -> Spread:
 
 def _pooled(value: np.ndarray, std: np.ndarray, unit: np.ndarray, p: _Posterior) -> dict[str, np.ndarray]:
     """θ_ij given all campaigns: mean, standard deviation and 95 % interval of a mixture of normals over the grid."""
-    kept = p.weight > 1e-5 * p.weight.max()
+    kept = p.weight > 1e-4 * p.weight.max()
     between, within, weight = p.between[kept] ** 2, p.within[kept], p.weight[kept] / p.weight[kept].sum()
     mean, variance, _ = _of_units(value, std, unit, within)
     # Of the unit given μ, then with that of μ.
@@ -250,9 +249,9 @@ def _quantile(
     """Of mixtures of normals, by halving."""
     low, high = centre - 12 * total, centre + 12 * total
     std = np.maximum(std, 1e-12 * total[:, None])
-    for _ in range(50):
+    for _ in range(30):
         middle = 0.5 * (low + high)
-        above = stats.norm.cdf((middle[:, None] - mean) / std) @ weight > q
+        above = ndtr((middle[:, None] - mean) / std) @ weight > q
         low, high = np.where(above, low, middle), np.where(above, middle, high)
     return 0.5 * (low + high)
 
@@ -272,7 +271,7 @@ def _outliers(rows: _Rows, value: np.ndarray, std: np.ndarray, scale: float, shi
         mean, variance, _ = _of_units(value[own], std[own], np.zeros(own.sum(), int), p.within)
         scatter = np.sqrt(p.between**2 + variance[0] + p.variance)
         # Two-sided chance of a value so far out, over the grid; that few units were there is in the grid's weights.
-        chance = p.weight @ (2 * stats.norm.sf(np.abs(mean[0] - p.mean) / scatter))
+        chance = p.weight @ (2 * ndtr(-np.abs(mean[0] - p.mean) / scatter))
         if chance * units < FALSE_ALARM:
             expected = float(p.weight @ p.mean)
             total = float(np.sqrt(p.weight @ (p.between**2 + p.variance + (p.mean - expected) ** 2)))
@@ -285,25 +284,31 @@ def _outliers(rows: _Rows, value: np.ndarray, std: np.ndarray, scale: float, shi
 def _drifts(rows: _Rows) -> Iterator[Drift]:
     """Units whose campaigns follow a line in time, against the scatter that they leave about it."""
     dated = bool(np.isfinite(rows.days).all())
-    fits = []
+    lines = []
     for k, name in enumerate(rows.names):
         own = np.flatnonzero(rows.unit == k)
         time = rows.days[own] if dated else np.arange(len(own), dtype=float)
-        if len(own) < FEWEST or np.ptp(time) == 0:
-            continue
-        weight = 1 / rows.std[own] ** 2
-        x = time - np.average(time, weights=weight)
-        y = rows.value[own] - np.average(rows.value[own], weights=weight)
-        information = weight @ x**2
-        slope = weight @ (x * y) / information
-        fits.append((name, slope, information, weight @ (y - slope * x) ** 2, len(own) - 2))
-    if not fits:
+        if len(own) >= FEWEST and np.ptp(time) > 0:
+            lines.append((name, rows.value[own, None], rows.std[own, None] ** 2, time[:, None]))
+    if not lines:
         return
-    # Scatter beyond the standard uncertainties is that of all lines together, and no less than them.
-    freedom = sum(f[4] for f in fits)
-    excess = max(sum(f[3] for f in fits) / freedom, 1.0)
-    for name, slope, information, _, _ in fits:
-        error = float(np.sqrt(excess / information))
-        chance = 2 * stats.t.sf(abs(slope) / error, freedom) if excess > 1.0 else 2 * stats.norm.sf(abs(slope) / error)
-        if chance * len(fits) < FALSE_ALARM:
-            yield Drift(name, float(slope), error, "day" if dated else "campaign")
+    # κ is that of what all lines leave.
+    levels = BEYOND * max(np.std(y - y.mean()) for _, y, _, _ in lines) * np.linspace(0.0, 1.0, LEVELS) ** 2
+    log, slopes, errors = np.zeros(LEVELS), [], []
+    for _, y, variance, time in lines:
+        weight = 1 / (variance + levels**2)
+        x = time - (weight * time).sum(0) / weight.sum(0)
+        y = y - (weight * y).sum(0) / weight.sum(0)
+        information = (weight * x**2).sum(0)
+        slope = (weight * x * y).sum(0) / information
+        misfit = (weight * (y - slope * x) ** 2).sum(0)
+        log += 0.5 * (np.log(weight).sum(0) - np.log(weight.sum(0)) - np.log(information) - misfit)
+        slopes.append(slope)
+        errors.append(1 / np.sqrt(information))
+    chance = np.gradient(levels) * np.exp(log - log.max())
+    chance /= chance.sum()
+    for (name, *_), slope, error in zip(lines, slopes, errors, strict=True):
+        if chance @ (2 * ndtr(-np.abs(slope) / error)) * len(lines) < FALSE_ALARM:
+            mean = float(chance @ slope)
+            std = float(np.sqrt(chance @ (error**2 + (slope - mean) ** 2)))
+            yield Drift(name, mean, std, "day" if dated else "campaign")
