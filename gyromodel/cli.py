@@ -228,6 +228,58 @@ def plan(
 
 
 @app.command()
+def sensitivity(
+    models: Annotated[list[Path], typer.Argument(metavar="M.yaml", help="A fitted model; or three, of axes x, y, z.")],
+    plan: Annotated[Path, typer.Option("--plan", metavar="PLAN.yaml", help="The mission: what every column does.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="DIR", help="Folder for figures and sensitivity.json.")
+    ] = None,
+    design: Annotated[
+        Path | None, typer.Option(metavar="PLAN2.yaml", help="The next campaign's plan; the mission's by default.")
+    ] = None,
+    outcome: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="rate, angle, peak, bias_temperature, attitude, position.")
+    ] = None,
+    candidates: Annotated[
+        Path | None, typer.Option(metavar="C.yaml", help="Parts of which to make the best test plan.")
+    ] = None,
+    budget: Annotated[str | None, typer.Option(metavar="TIME", help='Time for that plan, such as "4 h".')] = None,
+    criterion: Annotated[
+        Literal["parameters", "outcome", "discrimination"],
+        typer.Option(
+            help="What that plan is best for: parameters, the first outcome, or telling --rival effects apart."
+        ),
+    ] = "parameters",
+    rival: Annotated[list[str] | None, typer.Option(metavar="EFFECT", help="An effect to be told from others.")] = None,
+    sobol: Annotated[bool, typer.Option("--sobol", help="Sobol indices also where the outcome is linear.")] = False,
+    draws: Annotated[int, typer.Option(min=1000, metavar="N", help="Draws of all parameters.")] = 2000,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Tell what a calibration's errors do to a mission, where they come from, and what to measure next."""
+    if (candidates is None) != (budget is None):
+        raise typer.BadParameter("a test plan needs both --candidates and --budget", param_hint="--budget")
+    from gyromodel._study_files import print_sensitivity, run_sensitivity
+
+    found, result, chosen = run_sensitivity(
+        models, plan, design, outcome or [], candidates, budget, criterion, rival or [], sobol, draws, seed
+    )
+    if output:
+        from gyromodel.report import history_figure, tornado_figure
+
+        output.mkdir(parents=True, exist_ok=True)
+        write_text(output / "sensitivity.json", json_text(result))
+        write_text(output / "tornado.svg", tornado_figure(found))
+        write_text(output / "budget.svg", history_figure(found))
+    if as_json:
+        print(json_text(result), end="")
+        return
+    print_sensitivity(found, chosen)
+    if output:
+        print_paths(output, "sensitivity.json", "tornado.svg", "budget.svg")
+
+
+@app.command()
 def compensate(
     model: Annotated[Path, typer.Argument(metavar="M.yaml", help="A fitted model.")],
     campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Its output and what the model needs besides.")],

@@ -1,6 +1,7 @@
 """Campaigns that have not been measured yet, from a YAML plan of what every column is to do.
 
-A column is constant or a list of segments, whose last value stays; any key but the four below is metadata.
+A column is constant or a list of segments, whose last value stays; any key but the four below and `instruments`, the
+errors of columns, is metadata.
 
     gyro: fog
     kind: rate
@@ -18,7 +19,7 @@ A column is constant or a list of segments, whose last value stays; any key but 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,8 @@ from gyromodel.campaign import Campaign
 from gyromodel.units import UnitError, convertible, factor, from_internal, quantity, to_internal
 
 _KEYS = {"duration", "interval", "output", "columns"}
+# What a plan may say besides, that is no metadata of the campaign.
+_APART = {"instruments"}
 _MOST_SAMPLES = 100_000_000
 
 
@@ -51,12 +54,18 @@ def read_plan(path: str | Path) -> Campaign:
     if missing:
         raise CampaignError(f"{path}: a plan needs the keys {', '.join(sorted(_KEYS))}; missing: {', '.join(missing)}")
     try:
-        return _campaign(plan, path.stem)
+        return planned(plan, path.stem)
     except (CampaignError, UnitError) as error:
         raise CampaignError(f"{path}: {error}") from None
 
 
-def _campaign(plan: dict[str, Any], name: str) -> Campaign:
+def planned(plan: Mapping[str, Any], name: str) -> Campaign:
+    """The campaign of a plan that has been read.
+
+    Raises:
+        CampaignError: a segment is none.
+        UnitError: a quantity is none.
+    """
     duration, interval = _seconds("duration", plan["duration"]), _seconds("interval", plan["interval"])
     if not isinstance(plan["columns"], dict):
         raise CampaignError("columns must map column names to a value or a list of segments")
@@ -66,7 +75,7 @@ def _campaign(plan: dict[str, Any], name: str) -> Campaign:
     columns, units = {"time": time}, {"time": "s"}
     for column, course in plan["columns"].items():
         columns[column], units[column] = _course(f"column {column}", course, time)
-    metadata = {str(key): value for key, value in plan.items() if key not in _KEYS}
+    metadata = {str(key): value for key, value in plan.items() if key not in _KEYS | _APART}
     unit = str(plan["output"])
     # A campaign is checked to hold measurements, which a plan has not: it passes with a stand-in, taken out again.
     campaign = Campaign(columns | {"output": time}, units | {"output": unit}, metadata, name)

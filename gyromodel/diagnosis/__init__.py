@@ -1,5 +1,6 @@
 """What a simulation gets wrong: evidence, unknown drivers, extension, held-out gain and verdict."""
 
+from gyromodel.diagnosis._added_tests import AddedTest, added_tests
 from gyromodel.diagnosis._diagnose import diagnose
 from gyromodel.diagnosis._evidence import SAFE_THRESHOLD
 from gyromodel.diagnosis._isolation import Isolability, Size, isolability
@@ -17,6 +18,7 @@ from gyromodel.diagnosis._result import (
 
 __all__ = [
     "SAFE_THRESHOLD",
+    "AddedTest",
     "Candidate",
     "Cause",
     "Confuser",
@@ -28,6 +30,7 @@ __all__ = [
     "Round",
     "Size",
     "Verdict",
+    "added_tests",
     "diagnose",
     "isolability",
 ]

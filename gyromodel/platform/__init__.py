@@ -12,7 +12,7 @@ from gyromodel.platform._acceptance import (
 from gyromodel.platform._campaign import navigate_campaign
 from gyromodel.platform._drift import residual_drift
 from gyromodel.platform._earth import EARTH_RATE, earth_rate, gravity, radii, transport_rate
-from gyromodel.platform._errors import Errors, NavigationError, navigation_error
+from gyromodel.platform._errors import Errors, NavigationError, drift_errors, navigation_error, pushes_at_rest
 from gyromodel.platform._explanations import ALTERNATIVES, Alternative, Explanation, Points, explain, points, separation
 from gyromodel.platform._gimbals import (
     GimbalErrors,
@@ -60,6 +60,7 @@ __all__ = [
     "base_angles",
     "base_motion",
     "coning",
+    "drift_errors",
     "earth_rate",
     "euler_angles",
     "euler_attitude",
@@ -80,6 +81,7 @@ __all__ = [
     "nulled_gimbals",
     "points",
     "published_response",
+    "pushes_at_rest",
     "radii",
     "residual_drift",
     "sculling",

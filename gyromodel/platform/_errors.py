@@ -19,7 +19,7 @@ from gyromodel.model import GyroModel
 from gyromodel.numerics.rotations import exponential, inverse, logarithm, product, rotate
 from gyromodel.numerics.uncertain import Uncertain, together
 from gyromodel.platform._drift import residual_drift
-from gyromodel.platform._earth import radii
+from gyromodel.platform._earth import earth_rate, gravity, radii
 from gyromodel.platform._navigation import Navigation, attitudes, in_epochs, navigate
 
 
@@ -92,13 +92,40 @@ def navigation_error(
 def _errors(
     models: tuple[GyroModel, ...], signals: Any, start: Navigation, velocities: jax.Array, step: Any, every: int
 ) -> Errors:
+    return drift_errors(residual_drift(models, signals), start, velocities, step, every)
+
+
+@partial(jax.jit, static_argnames=("every", "level"))
+def drift_errors(
+    drift: Float[Array, "step 3"],
+    start: Navigation,
+    velocities: Float[Array, "step 3"],
+    step: Float[Array, ""] | float,
+    every: int = 1,
+    level: bool = False,
+    ideal: Navigation | None = None,
+) -> Errors:
+    """What a platform's drift makes of a navigation whose computer takes it for one that keeps its attitude.
+
+    Args:
+        drift: rate of the platform in inertial space during each step, in its own axes, rad/s.
+        start: before the first step.
+        velocities: integral of the specific force over each step that a platform without drift senses, m/s.
+        step: length of a step, s.
+        every: steps in an epoch.
+        level: whether the computer is told its height.
+        ideal: the navigation without drift, where it is at hand.
+
+    Returns:
+        The errors at the end of each epoch.
+    """
     still = jnp.array([1.0, 0.0, 0.0, 0.0])
-    turns = residual_drift(models, signals) * step
+    turns = drift * step
     turned = attitudes(still, turns)
     midway = product(turned, exponential(-0.5 * turns))
     fixed = jnp.zeros_like(velocities)
-    ideal = navigate(start, fixed, velocities, step, every)
-    made = navigate(start, fixed, rotate(inverse(midway), velocities), step, every)
+    ideal = navigate(start, fixed, velocities, step, every, level) if ideal is None else ideal
+    made = navigate(start, fixed, rotate(inverse(midway), velocities), step, every, level)
     true = product(ideal.attitude, in_epochs(turned, every)[:, -1])
     meridian, across = radii(ideal.position[:, 0])
     latitude, height = ideal.position[:, 0], ideal.position[:, 2]
@@ -109,3 +136,17 @@ def _errors(
         made.velocity - ideal.velocity,
         jnp.stack([north, up, east], axis=1),
     )
+
+
+def pushes_at_rest(start: Navigation, steps: int, step: float) -> Float[Array, "step 3"]:
+    """Integral of the specific force (m/s) over each step of a body at rest over the Earth, in axes that keep still.
+
+    Args:
+        start: its attitude and position.
+        steps: how many.
+        step: length of a step, s.
+    """
+    latitude, height = start.position[0], start.position[2]
+    turn = earth_rate(latitude) * (step * (jnp.arange(steps) + 0.5))[:, None]
+    up = jnp.array([0.0, 1.0, 0.0]) * gravity(latitude, height) * step
+    return rotate(inverse(start.attitude), rotate(exponential(turn), up))

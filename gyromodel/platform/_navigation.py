@@ -53,13 +53,14 @@ def attitudes(start: Float[Array, " 4"], rotations: Float[Array, "step 3"], ever
     return jax.lax.scan(epoch, start, in_epochs(rotations, every))[1]
 
 
-@partial(jax.jit, static_argnames="every")
+@partial(jax.jit, static_argnames=("every", "level"))
 def navigate(
     start: Navigation,
     rotations: Float[Array, "step 3"],
     velocities: Float[Array, "step 3"],
     step: Float[Array, ""] | float,
     every: int = 1,
+    level: bool = False,
 ) -> Navigation:
     """Attitude, then velocity, then position, from what gyros and accelerometers on the platform sense.
 
@@ -77,6 +78,7 @@ def navigate(
         velocities: integral of the specific force over each step, in the platform axes at its start, m/s.
         step: length of a step, s.
         every: steps in an epoch.
+        level: whether the height stays, as with an altimeter, instead of being navigated.
 
     Returns:
         The history, at the end of each epoch.
@@ -85,6 +87,7 @@ def navigate(
         ValueError: the steps are not a whole number of epochs.
     """
     length = step * every
+    sensed = jnp.array([1.0, 0.0, 1.0]) if level else jnp.ones(3)
 
     def sense(carry, increments):
         turned, pushed = carry
@@ -95,7 +98,8 @@ def navigate(
         """Rotation of the axes in an epoch, and change of velocity where its middle is at a position and velocity."""
         earth, transport, fall = _of_place(position, velocity)
         turn = length * (earth + transport)
-        return turn, pushed - 0.5 * cross(turn, pushed) + length * (fall - cross(2 * earth + transport, velocity))
+        change = pushed - 0.5 * cross(turn, pushed) + length * (fall - cross(2 * earth + transport, velocity))
+        return turn, change * sensed
 
     @jax.checkpoint
     def epoch(now, increments):

@@ -1,5 +1,6 @@
 """The report room: the verdict in a sentence, a page with the figures and tables behind it, and deviations drawn."""
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from gyromodel.report._isolation import isolability_rows, parted_words
@@ -9,13 +10,31 @@ from gyromodel.report._sentence import sentence
 
 if TYPE_CHECKING:
     from gyromodel.report._deviation import deviation_figure, noise_rows
+    from gyromodel.report._study import (
+        disagreements,
+        history_figure,
+        outcome_rows,
+        parameter_rows,
+        plan_sentence,
+        sobol_rows,
+        test_rows,
+        tornado_figure,
+    )
 
 __all__ = [
     "deviation_figure",
+    "disagreements",
+    "history_figure",
     "isolability_rows",
     "noise_rows",
+    "outcome_rows",
+    "parameter_rows",
     "parted_words",
+    "plan_sentence",
     "sentence",
+    "sobol_rows",
+    "test_rows",
+    "tornado_figure",
     "with_uncertainty",
     "write_report",
 ]
@@ -23,8 +42,7 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """What needs NumPy and JAX is imported when it is used: a sentence does not."""
-    if name not in ("deviation_figure", "noise_rows"):
+    if name not in __all__:
         raise AttributeError(f"module 'gyromodel.report' has no attribute {name!r}")
-    from gyromodel.report import _deviation
-
-    return getattr(_deviation, name)
+    room = "_deviation" if name in ("deviation_figure", "noise_rows") else "_study"
+    return getattr(import_module(f"gyromodel.report.{room}"), name)

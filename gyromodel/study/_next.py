@@ -1,0 +1,177 @@
+"""What to measure next: what one more test, less noise or a better instrument would leave of an outcome's uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from gyromodel.averages import average
+from gyromodel.campaign import Campaign
+from gyromodel.diagnosis import added_tests
+from gyromodel.effects import Effect
+from gyromodel.estimate import check_covariates, filter_of, given_ratios, whiten_columns
+from gyromodel.model import GyroModel, ModelError, check_units
+from gyromodel.signals import read_signals, with_columns_known
+from gyromodel.study._budget import Budget
+from gyromodel.study._instruments import Instrument, output_by_column
+from gyromodel.study._known import Known
+from gyromodel.study._mission import with_known_output
+from gyromodel.units import factor, internal_unit
+
+# The campaign that others are held against, and what an improvement leaves of an error.
+REPEATED, IMPROVED = "Repeat the run.", 0.5
+
+
+class NextTest(NamedTuple):
+    """One thing to do next.
+
+    Args:
+        sentence: what to do.
+        kind: whether it is another test, or the same with less "noise" or a better "instrument".
+        std: standard uncertainty of each outcome by its name after that, in its field unit; the mission's noise left out.
+    """
+
+    sentence: str
+    kind: str
+    std: dict[str, float]
+
+
+def information(
+    model: GyroModel,
+    campaign: Campaign,
+    instruments: Mapping[str, Instrument] | None = None,
+    noise: float = 1.0,
+    rivals: Sequence[Effect] = (),
+) -> Float[np.ndarray, "parameter parameter"]:
+    """Jᵀ V⁻¹ J of a planned campaign: what it says of the model's free parameters, internal units.
+
+    V is the model's noise and the instruments' errors; the independent ones add to the white noise of each sample.
+
+    Args:
+        model: with its values and its noise.
+        campaign: the output is not used.
+        instruments: errors of columns.
+        noise: times the model's noise.
+        rivals: effects whose linear coefficients follow on the model's parameters, were they added.
+
+    Raises:
+        ModelError: the model states no noise, or needs a column that is not there.
+    """
+    if not model.noise:
+        raise ModelError("what a test can tell depends on the noise: state noise_white and the rest in the model")
+    record = with_columns_known(read_signals(average(with_known_output(campaign))[0]))[0]
+    model = model.prepared(record.signals)
+    check_covariates(record, model)
+    check_units(model, record.output_unit, record.units)
+    ratios = given_ratios(record, model)
+    assert ratios is not None
+    std = noise * float(model.noise["noise_white"]) / np.sqrt(record.interval) * abs(float(model.gain()))
+    signals = record.signals
+    white, common = np.ones(len(record.sampling.present)), []
+    for name, instrument in (instruments or {}).items():
+        if name in signals:
+            change = output_by_column(model, signals, name) / std
+            all_along, own = instrument.sizes(np.asarray(signals[name]))
+            common.append(change * all_along)
+            white += (change * own) ** 2
+    record = record._replace(sampling=record.sampling._replace(white=jnp.asarray(white)))
+    added = [np.asarray(model.columns_of(effect, signals)) for effect in rivals]
+    jacobian = np.column_stack([np.asarray(model.linearise(signals)[1]), *added]) / std
+    columns = np.column_stack([jacobian, *common])
+    padded = jnp.asarray(np.pad(columns, ((0, 0), (0, -columns.shape[1] % 16))))
+    whitened = np.asarray(whiten_columns(filter_of(record, ratios), padded))[record.present.nonzero()[0]]
+    j, c = np.split(whitened[:, : columns.shape[1]], [jacobian.shape[1]], axis=1)
+    if not np.isfinite(whitened).all():
+        raise ModelError(f"the model has no finite derivative by its parameters on {campaign.name}")
+    cross = c.T @ j
+    return j.T @ j - cross.T @ np.linalg.solve(np.eye(len(common)) + c.T @ c, cross)
+
+
+def covariance_after(
+    errors: Float[np.ndarray, "parameter error"], told: Float[np.ndarray, "parameter parameter"]
+) -> Float[np.ndarray, "parameter parameter"]:
+    """(Σ⁻¹ + M)⁻¹ of Σ = A Aᵀ, as A (1 + Aᵀ M A)⁻¹ Aᵀ: a singular Σ is no harm.
+
+    Args:
+        errors: A.
+        told: information M of the new data.
+    """
+    inner = np.eye(errors.shape[1]) + errors.T @ told @ errors
+    return errors @ np.linalg.solve(inner, errors.T)
+
+
+def outcome_std(budget: Budget, covariance: Float[np.ndarray, "parameter parameter"]) -> float:
+    """Standard uncertainty of an outcome under another covariance of the parameters, in its field unit."""
+    variances = np.einsum("ij,jk,ik->i", budget.jacobian, covariance, budget.jacobian)
+    return float(np.sqrt(np.maximum(variances, 0.0).mean())) * factor(internal_unit(budget.unit), budget.unit)
+
+
+def blocks(parts: Sequence[np.ndarray]) -> np.ndarray:
+    """Matrices along a diagonal."""
+    size = sum(len(part) for part in parts)
+    matrix, start = np.zeros((size, size)), 0
+    for part in parts:
+        matrix[start : start + len(part), start : start + len(part)] = part
+        start += len(part)
+    return matrix
+
+
+def slower(campaign: Campaign) -> Campaign:
+    """Everything a campaign does at half the speed: soaks and ramps twice as long."""
+    rows = np.arange(2 * len(campaign))
+    time = campaign.columns["time"]
+    step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+    columns = {name: values[rows // 2] for name, values in campaign.columns.items()}
+    for name in campaign.covariates:
+        columns[name] = np.interp(rows / 2.0, np.arange(len(campaign)), campaign.columns[name])
+    return Campaign(columns | {"time": time[0] + step * rows}, campaign.units, campaign.metadata, campaign.name)
+
+
+def next_tests(
+    known: Known,
+    pairs: Sequence[tuple[Known, Budget]],
+    design: Campaign,
+    instruments: Mapping[str, Instrument],
+) -> tuple[NextTest, ...]:
+    """What each further test would leave of some outcomes' uncertainties; the one that helps the first most leads.
+
+    Each follows the calibration and has its parameters; a test that lacks a column for the model is left out.
+
+    Args:
+        known: the calibrated gyros.
+        pairs: budgets, each with the gyros that it is of.
+        design: the campaign that tests are variants of.
+        instruments: errors of its columns.
+    """
+    design = with_known_output(design)
+    tried: list[tuple[str, str, Campaign, Mapping[str, Instrument], float]] = [
+        (test.sentence, "test", test.campaign, instruments, 1.0) for test in added_tests(design)
+    ]
+    tried.append(
+        ("Do everything at half the speed: soaks and ramps twice as long.", "test", slower(design), instruments, 1.0)
+    )
+    tried.append(("Repeat the run with half the noise.", "noise", design, instruments, IMPROVED))
+    for name, instrument in instruments.items():
+        what = "reference rate" if name == "rate" else name
+        better = {**instruments, name: instrument.improved(IMPROVED)}
+        tried.append((f"Repeat the run with half the error of the {what}.", "instrument", design, better, 1.0))
+    found, problem = [], None
+    for sentence, kind, campaign, errors, noise in tried:
+        try:
+            told = [information(model, campaign, errors, noise) for model in known.models]
+        except ModelError as error:
+            problem = error
+            continue
+        std = {}
+        for gyros, budget in pairs:
+            each = told * (len(gyros.models) // len(told))
+            std[budget.outcome] = outcome_std(budget, covariance_after(gyros.factor, blocks(each)))
+        found.append(NextTest(sentence, kind, std))
+    if not found and problem is not None:
+        raise problem
+    leading = pairs[0][1].outcome
+    return tuple(sorted(found, key=lambda test: test.std[leading]))

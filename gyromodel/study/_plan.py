@@ -1,0 +1,293 @@
+"""The best test plan for a time: how often to do each of some candidate parts, by exchange (Fedorov, 1972).
+
+Parts are measured one after another with noise that starts anew in each, so that what they tell adds up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import yaml
+from jaxtyping import Float, Int
+
+from gyromodel._checks import CampaignError
+from gyromodel.campaign import Campaign
+from gyromodel.effects import Effect
+from gyromodel.model import ModelError, make_effect
+from gyromodel.plan import planned
+from gyromodel.signals import read_signals
+from gyromodel.study._known import Known
+from gyromodel.study._mission import with_known_output
+from gyromodel.study._next import blocks, covariance_after, information
+from gyromodel.units import UnitError, convertible, factor, internal_unit, quantity
+
+Criterion = Literal["parameters", "outcome", "discrimination"]
+# Standard errors, relative to what all candidates together leave, of parameters that nothing is known of before.
+VAGUE = 1e5
+# Relative gain of a score from which an exchange counts.
+LEAST_GAIN = 1e-9
+
+
+class Part(NamedTuple):
+    """A candidate part of a test plan: what it is called, how long it takes (s), and what happens in it."""
+
+    name: str
+    duration: float
+    campaign: Campaign
+
+
+class TestPlan(NamedTuple):
+    """How often to do each part.
+
+    Args:
+        times: by part; those not done are left out.
+        duration: of all, s.
+        covariance: of the parameters after it, internal units.
+        separation: least distance between two rival effects of typical size, in standard deviations; NaN without.
+    """
+
+    times: dict[str, int]
+    duration: float
+    covariance: Float[np.ndarray, "parameter parameter"]
+    separation: float
+
+    __test__ = False  # pytest takes the name for that of tests
+
+
+class PlanChoice(NamedTuple):
+    """The best plan beside the usual one, each part in turn.
+
+    Args:
+        criterion: what was made best.
+        best: that plan.
+        equal: each part in turn for as long.
+        gain: how many times narrower intervals are by the best plan, in the sense of the criterion; of a
+            discrimination how many times larger the separation is.
+    """
+
+    criterion: Criterion
+    best: TestPlan
+    equal: TestPlan
+    gain: float
+
+
+def read_candidates(path: str | Path) -> list[Part]:
+    """Candidate parts of a test plan.
+
+    The file is a plan whose `columns` hold unless a part says otherwise, with a list `candidates` of parts, each with
+    a `name`, a `duration` and its own `columns`.
+
+    Raises:
+        CampaignError: the file is none of that; the message names the part.
+    """
+    path = Path(path)
+    try:
+        plan = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise CampaignError(f"{path}: is no YAML file: {' '.join(str(error).split())}") from None
+    needed = {"interval", "output", "columns", "candidates"}
+    missing = sorted(needed - set(plan)) if isinstance(plan, dict) else sorted(needed)
+    if missing or not isinstance(plan["columns"], dict) or not isinstance(plan["candidates"], list):
+        raise CampaignError(f"{path}: needs interval, output, columns and a list of candidates")
+    usual, parts = plan.pop("columns"), []
+    for number, given in enumerate(plan.pop("candidates"), 1):
+        if not isinstance(given, dict) or set(given) - {"name", "columns"} != {"duration"}:
+            raise CampaignError(f"{path}: candidate {number} needs a duration, and may have a name and columns")
+        name, own = str(given.get("name", number)), given.get("columns") or {}
+        if not isinstance(own, dict) or (unknown := set(own) - set(usual)):
+            said = (
+                f"has a column {min(unknown)} that the others lack: state its usual value" if own else "has no columns"
+            )
+            raise CampaignError(f"{path}: candidate {name} {said}")
+        try:
+            campaign = planned({**plan, "duration": given["duration"], "columns": {**usual, **own}}, name)
+            parts.append(Part(name, seconds(given["duration"]), campaign))
+        except (CampaignError, UnitError) as error:
+            raise CampaignError(f"{path}: candidate {name}: {error}") from None
+    if len({part.name for part in parts}) < len(parts) or not parts:
+        raise CampaignError(f"{path}: give each candidate a name of its own")
+    return parts
+
+
+def seconds(text: Any) -> float:
+    """A time with its unit, above zero."""
+    value, unit = quantity(str(text))
+    if not convertible(unit, "s") or not value > 0:
+        raise CampaignError(f"expected a time above zero with its unit, such as 4 h, not {text}")
+    return value * factor(unit, "s")
+
+
+def best_plan(
+    known: Known,
+    parts: Sequence[Part],
+    budget: float,
+    criterion: Criterion = "parameters",
+    *,
+    jacobian: Float[np.ndarray, "entry parameter"] | None = None,
+    rivals: Sequence[str] = (),
+    anew: bool = False,
+    instruments: Mapping[str, Any] | None = None,
+) -> PlanChoice:
+    """The plan that tells most within a time, by exchange from two starts.
+
+    Args:
+        known: the calibrated gyro, whose values and noise it takes.
+        parts: candidates; each may be done several times.
+        budget: time for all, s.
+        criterion: the least determinant of the parameters' covariance ("parameters": D-optimal), the least variance of
+            an outcome ("outcome": c- or A-optimal), or the largest of the least separations of rival effects
+            ("discrimination": T-optimal).
+        jacobian: derivative of the outcome, for "outcome".
+        rivals: effects to be told apart, for "discrimination"; at their typical sizes.
+        anew: whether the calibration counts for nothing, instead of what the plan adds to.
+        instruments: errors of columns.
+
+    Raises:
+        ModelError: no part fits the time, or the criterion lacks what it needs.
+    """
+    durations = np.array([part.duration for part in parts])
+    if not (durations <= budget).any():
+        raise ModelError(f"no candidate fits into {budget:g} s; the shortest takes {durations.min():g} s")
+    if criterion == "outcome" and jacobian is None:
+        raise ModelError("a plan for an outcome needs its derivative")
+    if criterion == "discrimination" and (len(rivals) < 2 or len(known.models) > 1):
+        raise ModelError("a plan that tells effects apart needs two rival effects or more, and one gyro")
+    joint = read_signals([with_known_output(part.campaign, i) for i, part in enumerate(parts)])
+    models = tuple(model.prepared(joint.signals) for model in known.models)
+    effects = [make_effect(label).prepared(joint.signals) for label in rivals]
+    told = np.stack([
+        blocks([information(m, part.campaign, instruments, rivals=effects) for m in models]) for part in parts
+    ])  # fmt: skip
+    count = len(known.vector)
+    errors = known.factor
+    if anew:
+        most = told[:, :count, :count].sum(axis=0).diagonal()
+        if not (most > 0).all():
+            raise ModelError("the candidates together tell nothing of a parameter of the model: add another part")
+        errors = np.diag(VAGUE / np.sqrt(most))
+    score = _score(criterion, errors, jacobian, effects)
+    start = _in_turn(durations, budget)
+    found = [_exchanged(n, told, durations, budget, score) for n in (np.zeros(len(parts), int), start)]
+    best = max(found, key=lambda n: score(np.tensordot(n, told, 1)[None])[0])
+    separation = _score("discrimination", errors, None, effects) if rivals else None
+
+    def plan(n: np.ndarray) -> TestPlan:
+        total = np.tensordot(n, told, 1)
+        covariance = covariance_after(errors, total[:count, :count])
+        apart = float(separation(total[None])[0]) if separation else np.nan
+        times = {part.name: int(k) for part, k in zip(parts, n, strict=True) if k}
+        return TestPlan(times, float(n @ durations), covariance, apart)
+
+    after, before = (float(score(np.tensordot(n, told, 1)[None])[0]) for n in (best, start))
+    # Scores are ln det of the information, minus ln variance, and ln separation squared.
+    gain = np.exp((after - before) / (2.0 * (count if criterion == "parameters" else 1)))
+    return PlanChoice(criterion, plan(best), plan(start), float(gain))
+
+
+def _score(
+    criterion: Criterion, errors: np.ndarray, jacobian: np.ndarray | None, effects: Sequence[Effect]
+) -> Callable[[np.ndarray], np.ndarray]:
+    """A score of stacks of information matrices, the larger the better."""
+    count = len(errors)
+
+    def inner(told: np.ndarray) -> np.ndarray:
+        return np.eye(errors.shape[1]) + errors.T @ told[:, :count, :count] @ errors
+
+    if criterion == "parameters":
+        return lambda told: np.linalg.slogdet(inner(told))[1]
+    if criterion == "outcome":
+        assert jacobian is not None
+        seen = jacobian @ errors
+        gram = seen.T @ seen / len(seen)
+
+        def known_well(told: np.ndarray) -> np.ndarray:
+            left = np.linalg.solve(inner(told), np.broadcast_to(gram, (len(told), *gram.shape)))
+            return -np.log(np.trace(left, axis1=1, axis2=2))
+
+        return known_well
+    sizes = [typical(effect) for effect in effects]
+    ends = count + np.cumsum([0, *(len(size) for size in sizes)])
+    places = [np.arange(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+
+    def apart(told: np.ndarray) -> np.ndarray:
+        least = np.full(len(told), np.inf)
+        for a, size in zip(places, sizes, strict=True):
+            for b in places:
+                if b is a:
+                    continue
+                # What neither the parameters, as far as they are open, nor the rival take of the effect.
+                open_ = np.concatenate([errors, np.zeros((len(b), errors.shape[1]))])
+                free = np.zeros((len(open_), len(b)))
+                rows = np.concatenate([np.arange(count), b])
+                own = np.sqrt(told[:, b, b].max() + 1e-300)
+                free[count:] = np.eye(len(b)) * VAGUE / own
+                span = np.concatenate([open_, free], axis=1)
+                seen = span.T @ told[:, rows][:, :, a] @ size
+                taken = np.linalg.solve(
+                    np.eye(span.shape[1]) + span.T @ told[:, rows][:, :, rows] @ span, seen[:, :, None]
+                )
+                whole = np.einsum("i,nij,j->n", size, told[:, a][:, :, a], size)
+                least = np.minimum(least, whole - np.einsum("ni,ni->n", seen, taken[:, :, 0]))
+        return np.log(np.maximum(least, 1e-300))
+
+    return apart
+
+
+def typical(effect: Effect) -> np.ndarray:
+    """Typical values of an effect's linear coefficients, internal units."""
+    sizes = []
+    for name, declared in effect.declared().items():
+        if declared.linear:
+            value = declared.typical * factor(declared.unit, internal_unit(declared.unit))
+            sizes.append(np.full(jnp.size(getattr(effect, name)), value))
+    return np.concatenate(sizes)
+
+
+def _in_turn(durations: np.ndarray, budget: float) -> Int[np.ndarray, " part"]:
+    """Each part in turn, as long as one fits."""
+    times, left = np.zeros(len(durations), int), budget
+    while (fits := durations <= left * (1 + 1e-12)).any():
+        for i in np.flatnonzero(fits):
+            if durations[i] <= left * (1 + 1e-12):
+                times[i] += 1
+                left -= durations[i]
+    return times
+
+
+def _exchanged(
+    times: np.ndarray, told: np.ndarray, durations: np.ndarray, budget: float, score: Callable[[np.ndarray], np.ndarray]
+) -> Int[np.ndarray, " part"]:
+    """Fill up a plan and exchange its parts for others until no exchange of one helps."""
+
+    def of(plans: list[np.ndarray]) -> np.ndarray:
+        return score(np.tensordot(np.array(plans), told, 1))
+
+    def filled(n: np.ndarray) -> np.ndarray:
+        while (fits := np.flatnonzero(durations <= (budget - n @ durations) * (1 + 1e-12) + 1e-9)).size:
+            more = [n + (np.arange(len(n)) == i) for i in fits]
+            gained = (of(more) - of([n])[0]) / durations[fits]
+            n = more[int(np.argmax(gained))]
+        return n
+
+    times = filled(times)
+    now = of([times])[0]
+    while True:
+        tried = []
+        for i in np.flatnonzero(times):
+            for j in range(len(times)):
+                n = times - (np.arange(len(times)) == i)
+                room = int((budget - n @ durations) * (1 + 1e-12) / durations[j])
+                if j != i and room:
+                    tried.append(n + room * (np.arange(len(times)) == j))
+        if not tried:
+            return times
+        scores = of(tried)
+        at = int(np.argmax(scores))
+        if not scores[at] > now + LEAST_GAIN * max(abs(now), 1.0):
+            return times
+        times = filled(tried[at])
+        now = of([times])[0]
