@@ -117,10 +117,17 @@ def tornado_figure(found: Sensitivity) -> str:
         figure.clear()
         shown = [r.budget for r in found.results if r.budget.std > 0 or r.budget.total > 0][:4]
         counts = [len(_bars(budget)) for budget in shown]
-        figure.set_size_inches(6.6, sum(0.28 * n + 0.85 for n in counts))
+        figure.set_size_inches(6.6, 0.3 + sum(0.28 * n + 0.85 for n in counts))
         panels = figure.subplots(len(shown), 1, squeeze=False, height_ratios=[n + 2 for n in counts])[:, 0]
         for panel, budget in zip(panels, shown, strict=True):
             _tornado(panel, budget)
+        for colour, text in (
+            (draw.AFTER, "parameter larger"),
+            (draw.BEFORE_DOT, "smaller"),
+            (draw.BEFORE, "either way"),
+        ):
+            panels[0].barh(0, 0.0, color=colour, label=text)
+        draw.legend(panels[0], 3)
         return draw.rendered(figure, "tornado")
 
 
@@ -148,7 +155,7 @@ def _tornado(axes: Axes, budget: Budget) -> None:
     axes.axvline(0.0, color=draw.INK, linewidth=0.8)
     axes.grid(visible=False, axis="y")
     title = budget.outcome.replace("_", " ")
-    axes.set_xlabel(draw.axis_label(f"{title}, change at ±1 standard uncertainty", budget.unit, power))
+    axes.set_xlabel(draw.axis_label(f"{title} at ±1 standard uncertainty", budget.unit, power))
 
 
 def history_figure(found: Sensitivity) -> str:
@@ -157,7 +164,7 @@ def history_figure(found: Sensitivity) -> str:
         figure, axes = draw.blank()
         figure.set_size_inches(6.6, 3.6)
         history = found.history
-        hours = history.time[-1] > 2 * 3600
+        hours = history.time[-1] > 3600
         time = history.time / (3600.0 if hours else 1.0)
         power = draw.power_of_ten(float(np.max([history.std.max(), *(a.max() for a in history.alone.values())])))
         scale = 10.0**-power

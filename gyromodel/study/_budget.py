@@ -178,8 +178,9 @@ def budget(
         caused = float(((jacobian @ part) ** 2).sum(axis=1).mean()) / (variance or 1.0)
         stages[source.name] = stages.get(source.name, 0.0) + caused
     noise, added = _of_errors(outcome, mission, record, instruments, at)
+    value = float(values[0]) * unit if len(values) == 1 else None
     return Budget(
-        outcome.name, outcome.unit, float(values[0]) * unit if len(values) == 1 else None, float(np.sqrt(variance)) * unit,
+        outcome.name, outcome.unit, value, float(np.sqrt(variance)) * unit,
         tuple(sorted(rows, key=lambda r: -abs(r.share))), stages,
         {k: v * unit for k, v in noise.items()}, {k: v * unit for k, v in added.items()}, jacobian,
     )  # fmt: skip
@@ -230,7 +231,7 @@ def _each_axis(mission: Mission, record: Record, rows: np.ndarray | None) -> tup
         span = record_span(record)
         white = float(model.noise["noise_white"]) ** 2 / record.interval
         ratios = NoiseRatios(*(np.asarray(r, float) for r in ratios))
-        none = NoiseRatios(*(np.zeros(()),) * 3, ratios.constant)
+        none = NoiseRatios(np.zeros(()), np.zeros(()), np.zeros(()), ratios.constant)
         cells = [none] + [none._replace(**{field: getattr(ratios, field)}) for field in KINDS.values()]
         caused = []
         for cell in cells:

@@ -1,4 +1,4 @@
-"""What to measure next: what one more test, less noise or a better instrument would leave of an outcome's uncertainty."""
+"""What to measure next: what one more test, less noise or a better instrument leaves of an outcome's uncertainty."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class NextTest(NamedTuple):
     Args:
         sentence: what to do.
         kind: whether it is another test, or the same with less "noise" or a better "instrument".
-        std: standard uncertainty of each outcome by its name after that, in its field unit; the mission's noise left out.
+        std: standard uncertainty of each outcome by its name after that, in its field unit, less the mission's noise.
     """
 
     sentence: str

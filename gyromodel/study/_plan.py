@@ -6,6 +6,7 @@ Parts are measured one after another with noise that starts anew in each, so tha
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -211,7 +212,7 @@ def _score(
         return known_well
     sizes = [typical(effect) for effect in effects]
     ends = count + np.cumsum([0, *(len(size) for size in sizes)])
-    places = [np.arange(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    places = [np.arange(a, b) for a, b in pairwise(ends)]
 
     def apart(told: np.ndarray) -> np.ndarray:
         least = np.full(len(told), np.inf)

@@ -40,7 +40,7 @@ class Result:
 
 @dataclass(frozen=True)
 class History:
-    """The angle's error over the mission: its standard uncertainty (deg) in all and by parameter alone, at times (s)."""
+    """The angle's standard uncertainty (deg) over the mission, in all and by parameter alone, at times (s)."""
 
     time: Float[np.ndarray, " epoch"]
     std: Float[np.ndarray, " epoch"]
@@ -204,7 +204,7 @@ def _outside(gyros: Known, mission: Mission, rows: int) -> list[str]:
 
 @eqx.filter_jit
 def _angles(models, vector: Array, mission: Mission) -> tuple[Array, Array]:
-    """Derivative of the running angle's error by the parameters, of the first axis, and the time at each sample's end."""
+    """Derivative of the running angle's error by the parameters, of the first axis, and when each sample ends."""
 
     def running(v):
         return jnp.cumsum(mission.errors(models_at(models, v))[0] * mission.duration)

@@ -1,0 +1,393 @@
+"""Error budgets: closed forms, dense linear algebra, published indices and designs.
+
+Ishigami's indices (a = 7, b = 0.1) are those of Saltelli and others, *Global Sensitivity Analysis: The Primer*, 2008,
+p. 182; D-optimal designs of a line and of a parabola on [−1, 1] those of Atkinson, Donev and Tobias, *Optimum
+Experimental Designs*, 2007, chapter 11.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from gyromodel import cli
+from gyromodel.campaign import Campaign
+from gyromodel.effects.drivers import Bias
+from gyromodel.effects.scale import ScaleFactor, ScaleNonlinearity
+from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureRate
+from gyromodel.estimate import Calibration, fit
+from gyromodel.model import GyroModel, ModelError, simulate
+from gyromodel.model_files import write_model
+from gyromodel.numerics.uncertain import Uncertain
+from gyromodel.study import (
+    OUTCOMES,
+    Instrument,
+    Outcome,
+    Part,
+    best_plan,
+    covariance_after,
+    information,
+    known,
+    sensitivity,
+    sobol_indices,
+    symmetric_factor,
+)
+
+DEG_H = np.pi / 180 / 3600
+ROWS, STEP = 200, 10.0
+WHITE, WALK = 1e-6, 1e-10
+
+
+def mission(rate: float = 0.0, temperature: float | np.ndarray = 20.0, **metadata: float) -> Campaign:
+    """Deg/s and °C over 2000 s."""
+    time = np.arange(ROWS) * STEP
+    columns = {"time": time, "rate": np.full(ROWS, rate), "temperature": np.zeros(ROWS) + temperature, "output": time}
+    units = {"time": "s", "rate": "deg/s", "temperature": "degC", "output": "deg/s"}
+    return Campaign(columns, units, {"kind": "rate", **metadata}, "mission")
+
+
+RAMP = np.linspace(20.0, 60.0, ROWS)
+THERMAL = (Bias(value=2 * DEG_H), BiasTemperature(coefficient=0.1 * DEG_H, reference=20.0))
+NOISE = {"noise_white": WHITE, "noise_random_walk": WALK}
+
+
+def thermal(covariance: np.ndarray, noise: dict[str, float] | None = None) -> Calibration:
+    return Calibration(GyroModel(THERMAL, NOISE if noise is None else noise), covariance)
+
+
+COVARIANCE = np.array([[0.04, -0.0005], [-0.0005, 1e-4]]) * DEG_H**2
+
+
+def test_a_scale_factor_error_turns_into_an_angle():
+    """t ω σ_S/S."""
+    model = GyroModel((ScaleFactor(value=2.0, unit="1"),))
+    found = sensitivity(Calibration(model, np.array([[1e-6**2 * 4]])), mission(rate=10.0), ["angle", "rate"])
+    angle, rate = (result.budget for result in found.results)
+    assert angle.std == pytest.approx(2000.0 * 10.0 * 1e-6)
+    assert rate.std == pytest.approx(10.0 * 3600 * 1e-6)
+    assert angle.rows[0].sensitivity == pytest.approx(2000.0 * 10.0 / 2.0)
+    assert not found.tests
+    assert "no noise" in found.warnings[0]
+    assert found.history.std[-1] == pytest.approx(angle.std)
+    assert found.history.std[0] == pytest.approx(angle.std / ROWS)
+
+
+def test_correlated_errors_cancel():
+    """At 21 °C bias and slope enter alike: var = σ² + σ² + 2 r σ²."""
+    r = -0.99
+    found = sensitivity(thermal(np.array([[1, r], [r, 1]]) * DEG_H**2), mission(temperature=21.0), ["rate"])
+    budget = found.results[0].budget
+    assert budget.std == pytest.approx(np.sqrt(2 + 2 * r))
+    assert [row.alone for row in budget.rows] == pytest.approx([1.0, 1.0])
+    assert [row.share for row in budget.rows] == pytest.approx([0.5, 0.5])
+
+
+def test_noise_and_instruments_have_closed_forms():
+    """White: N√t; random walk from the start: K √(t³/3); one thermometer error: slope·t, one a sample: /√n."""
+    t = ROWS * STEP
+    found = sensitivity(
+        thermal(COVARIANCE),
+        mission(temperature=RAMP),
+        ["angle", "rate"],
+        instruments={"temperature": Instrument(0.5, 0.2)},
+    )
+    angle, rate = (result.budget for result in found.results)
+    assert np.deg2rad(angle.noise["noise_white"]) == pytest.approx(WHITE * np.sqrt(t))
+    assert np.deg2rad(angle.noise["noise_random_walk"]) == pytest.approx(WALK * np.sqrt(t**3 / 3), rel=0.01)
+    assert rate.noise["noise_white"] * DEG_H == pytest.approx(WHITE / np.sqrt(STEP))
+    assert set(angle.noise) == {"noise_white", "noise_random_walk"}
+    slope = 0.1 / 3600 * t
+    assert angle.instruments["temperature"] == pytest.approx(slope * np.hypot(0.5, 0.2 / np.sqrt(ROWS)))
+    assert rate.instruments["temperature"] == pytest.approx(0.1 * np.hypot(0.5, 0.2))
+
+
+def test_draws_bear_the_first_order_out_and_shares_add_up(seed: int):
+    """Draws differ by more than four standard errors in 1 of 16 000."""
+    found = sensitivity(thermal(COVARIANCE), mission(temperature=RAMP), seed=seed)
+    assert [r.budget.outcome for r in found.results] == ["rate", "angle", "peak", "bias_temperature"]
+    for result in found.results:
+        assert sum(row.share for row in result.budget.rows) == pytest.approx(1.0)
+        assert result.drawn.agrees
+        assert bool(result.sobol) == (result.budget.outcome == "peak")
+    bt = found.results[3].budget
+    assert (bt.value, bt.std) == (pytest.approx(0.1), pytest.approx(0.01))
+    peak = found.results[2]
+    assert peak.drawn.std >= peak.budget.std * 0.95  # the largest of many is larger than each
+
+
+def test_an_outcome_that_bends_is_found_out(seed: int):
+    """b + b²/σ: the draws' mean square is σ² + 3σ², and half of the variance is that of b² by itself."""
+    sigma = 0.2 * DEG_H
+
+    def bent(mission, model):
+        change = model.effects[0].value - mission.models[0].effects[0].value
+        return change + change**2 / sigma
+
+    outcome = Outcome("bent", "deg/h", bent, of="models")
+    [result] = sensitivity(thermal(COVARIANCE), mission(temperature=RAMP), [outcome], seed=seed, draws=4000).results
+    assert result.budget.std == pytest.approx(0.2)
+    assert not result.drawn.agrees
+    assert result.drawn.std == pytest.approx(0.4, abs=6 * result.drawn.std_error)
+    assert result.sobol[0].name == "bias value"
+    assert result.sobol[0].total == pytest.approx(1.0, abs=0.1)
+
+
+def test_stages_are_kept_apart():
+    """Two sources with variances 1 and 3."""
+    model = GyroModel(THERMAL[:1], NOISE)
+    first = Uncertain.stated(jnp.zeros(1), 1.0, "rate table")
+    second = Uncertain.stated(jnp.zeros(1), 3.0, "chamber")
+    both = Uncertain(np.asarray(model.vector()), model.with_vector, {**first.sources, **second.sources})
+    stages = sensitivity(both, mission(), ["rate"]).results[0].budget.stages
+    assert stages == {"rate table": pytest.approx(0.25), "chamber": pytest.approx(0.75)}
+
+
+def test_three_gyros_turn_a_platform():
+    """Tilts b sin(ωt)/ω with Schuler's ω, and b t in azimuth, to what the Earth turns in half an hour; 13 % at most."""
+    covariance = np.diag([0.04, 1e-12]) * DEG_H**2
+    found = sensitivity(thermal(covariance), mission(latitude_deg=40.0), ["attitude"], draws=1000)
+    budget, drawn = found.results[0].budget, found.results[0].drawn
+    t, w = ROWS * STEP, np.sqrt(9.8 / 6.37e6)
+    expected = 0.2 / 3600 * np.sqrt((2 * (np.sin(w * t) / w) ** 2 + t**2) / 3)
+    assert budget.std / 60 == pytest.approx(expected, rel=0.13)
+    assert drawn.agrees
+    assert budget.rows[0].share == pytest.approx(1.0)
+    assert len(budget.rows) == 2
+
+
+def ishigami(z: np.ndarray) -> np.ndarray:
+    x = np.pi * (2 * norm.cdf(z) - 1)
+    return np.sin(x[:, 0]) + 7 * np.sin(x[:, 1]) ** 2 + 0.1 * x[:, 2] ** 4 * np.sin(x[:, 0])
+
+
+def test_sobol_indices_of_ishigamis_function(seed: int):
+    found = sobol_indices(ishigami, ["a", "b", "c"], base=4096, seed=seed % 1000)
+    assert [i.first for i in found] == pytest.approx([0.3139, 0.4424, 0.0], abs=0.04)
+    assert [i.total for i in found] == pytest.approx([0.5576, 0.4424, 0.2437], abs=0.04)
+    assert all(0 < i.first_conf < 0.1 for i in found)
+
+
+def test_the_symmetric_factor_is_a_root_that_treats_all_alike():
+    std = np.array([1.0, 10.0, 0.1])
+    correlation = np.array([[1, 0.5, 0.2], [0.5, 1, -0.3], [0.2, -0.3, 1]])
+    root = symmetric_factor(correlation * np.outer(std, std))
+    assert root @ root.T == pytest.approx(correlation * np.outer(std, std))
+    scaled = root / std[:, None]
+    assert scaled == pytest.approx(scaled.T)
+
+
+def test_what_a_test_tells_is_that_of_the_dense_covariance():
+    """V = σ²I + c cᵀ + diag, inverted as a whole."""
+    model = thermal(COVARIANCE, {"noise_white": WHITE}).model
+    instruments = {"temperature": Instrument(0.5, 0.2), "rate": Instrument(1e-6)}
+    told = information(model, mission(temperature=RAMP), instruments)
+    j = np.column_stack([np.ones(ROWS), RAMP - 20.0])
+    v = np.eye(ROWS) * WHITE**2 / STEP + (0.1 * DEG_H) ** 2 * (0.25 * np.ones((ROWS, ROWS)) + 0.04 * np.eye(ROWS))
+    v += 1e-12 * np.ones((ROWS, ROWS))
+    assert told == pytest.approx(j.T @ np.linalg.solve(v, j), rel=1e-6)
+    after = covariance_after(np.linalg.cholesky(COVARIANCE), told)
+    assert after == pytest.approx(np.linalg.inv(np.linalg.inv(COVARIANCE) + told), rel=1e-6)
+
+
+def test_the_next_test_halves_the_variance_of_the_last():
+    """After a fit of white noise alone, the same again."""
+    campaign = simulate(GyroModel(THERMAL, {"noise_white": WHITE}), mission(temperature=RAMP), seed=1)
+    estimate = fit(campaign, GyroModel(THERMAL, {"noise_white": WHITE}))
+    found = sensitivity(estimate, campaign, ["angle"], instruments={"temperature": Instrument(1.0)})
+    free = sensitivity(estimate, campaign, ["angle"])
+    now = free.results[0].budget.std
+    then = {test.sentence: test.std["angle"] for test in free.tests}
+    assert then["Repeat the run."] == pytest.approx(now / np.sqrt(2), rel=1e-3)
+    assert then["Repeat the run with half the noise."] == pytest.approx(now / np.sqrt(5), rel=1e-3)
+    assert list(then.values()) == sorted(then.values())
+    assert "half the noise" in (free.instrument_to_improve() or "")
+    with_thermometer = {test.sentence: test.std["angle"] for test in found.tests}
+    better = with_thermometer["Repeat the run with half the error of the temperature."]
+    assert then["Repeat the run."] < better < with_thermometer["Repeat the run."] < now
+
+
+def levels(rates: list[float]) -> list[Part]:
+    """One minute at each rate (deg/s)."""
+    parts = []
+    for rate in rates:
+        time = np.arange(6) * STEP
+        columns = {"time": time, "rate": np.full(6, rate), "output": time}
+        units = {"time": "s", "rate": "deg/s", "output": "deg/s"}
+        parts.append(Part(f"{rate:g}", 60.0, Campaign(columns, units, {"kind": "rate"}, f"{rate:g}")))
+    return parts
+
+
+LINE = (ScaleFactor(value=1.0, unit="1"), Bias())
+PARABOLA = (*LINE, ScaleNonlinearity(coefficients=jnp.zeros(1), powers=(2,), full_rate=np.deg2rad(2.0)))
+
+
+def gyro(effects: tuple) -> GyroModel:
+    return GyroModel(effects, {"noise_white": WHITE})
+
+
+def test_the_d_optimal_line_is_measured_at_its_ends():
+    """Ten minutes: Σr² is 40 instead of the 20 of each rate twice."""
+    calibration = Calibration(gyro(LINE), np.eye(2))
+    choice = best_plan(known(calibration), levels([-2, -1, 0, 1, 2]), 600.0, anew=True)
+    assert choice.best.times == {"-2": 5, "2": 5}
+    assert choice.equal.times == dict.fromkeys(("-2", "-1", "0", "1", "2"), 2)
+    assert choice.gain == pytest.approx(2**0.25, rel=1e-4)
+
+
+def test_the_d_optimal_parabola_is_measured_at_its_ends_and_in_the_middle():
+    calibration = Calibration(gyro(PARABOLA), np.eye(3))
+    choice = best_plan(known(calibration), levels([-2, -1.5, -1, -0.5, 0, 0.5, 1, 1.5, 2]), 540.0, anew=True)
+    assert choice.best.times == {"-2": 3, "0": 3, "2": 3}
+
+
+def test_the_plan_for_an_outcome_is_the_best_of_all():
+    """The line at 2 deg/s, over all ways to spend six minutes on four rates."""
+    rates, x = [-1.0, 0.0, 1.0, 1.5], np.deg2rad(2.0)
+    calibration = Calibration(gyro(LINE), np.eye(2))
+    seen = np.array([[x, 1.0]])
+    choice = best_plan(known(calibration), levels(rates), 360.0, "outcome", jacobian=seen, anew=True)
+    variances = []
+    for n in itertools.product(range(7), repeat=4):
+        if sum(n) == 6 and sum(k > 0 for k in n) > 1:
+            j = np.repeat([[np.deg2rad(r), 1.0] for r in rates], n, axis=0)
+            variances.append(float((seen @ np.linalg.inv(j.T @ j) @ seen.T)[0, 0]) * WHITE**2 / 60.0)
+    assert (seen @ choice.best.covariance @ seen.T)[0, 0] == pytest.approx(min(variances), rel=1e-4)
+
+
+def test_rivals_are_told_apart_by_the_part_that_parts_them():
+    """A slope over temperature and one over its rate: soaks show the first alone, and a ramp parts them."""
+    parts = []
+    for name, course in (("cold", np.full(ROWS, 20.0)), ("warm", np.full(ROWS, 60.0)), ("ramp", RAMP)):
+        parts.append(Part(name, ROWS * STEP, mission(temperature=course)))
+    calibration = Calibration(gyro((Bias(),)), np.array([[1.0]]))
+    rivals = [BiasTemperature.id, BiasTemperatureRate.id]
+    choice = best_plan(known(calibration), parts, 3 * ROWS * STEP, "discrimination", rivals=rivals)
+    assert choice.best.times.get("ramp", 0) > 0
+    assert choice.gain == pytest.approx(choice.best.separation / choice.equal.separation) or choice.gain > 1
+    assert choice.best.separation >= choice.equal.separation
+    with pytest.raises(ModelError, match="two rival effects"):
+        best_plan(known(calibration), parts, 3 * ROWS * STEP, "discrimination")
+    with pytest.raises(ModelError, match="fits into"):
+        best_plan(known(calibration), parts, 10.0)
+
+
+PLAN = """
+kind: rate
+duration: 2000 s
+interval: 10 s
+output: deg/s
+instruments: {temperature: 0.5 degC}
+columns:
+  rate: 0 deg/s
+  temperature: [{for: 2000 s, from: 20 degC, to: 60 degC}]
+"""
+CANDIDATES = """
+kind: rate
+interval: 10 s
+output: deg/s
+columns: {rate: 0 deg/s, temperature: 20 degC}
+candidates:
+  - {name: cold, duration: 2000 s}
+  - {name: warm, duration: 2000 s, columns: {temperature: 60 degC}}
+"""
+
+
+def run(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["sensitivity", *map(str, arguments)])
+    return int(ended.value.code or 0)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("study")
+    model = GyroModel(THERMAL, {"noise_white": WHITE})
+    write_model(fit(simulate(model, mission(temperature=RAMP), seed=1), model), folder / "model.yaml")
+    write_model(model, folder / "bare.yaml")
+    (folder / "plan.yaml").write_text(PLAN, encoding="utf-8")
+    (folder / "candidates.yaml").write_text(CANDIDATES, encoding="utf-8")
+    return folder
+
+
+def test_the_command_writes_what_it_prints(files: Path, capsys: pytest.CaptureFixture[str]):
+    (files / "hot.yaml").write_text(PLAN.replace("to: 60", "to: 90"), encoding="utf-8")
+    common = [files / "model.yaml", "--plan", files / "hot.yaml", "-o", files / "out", "--outcome", "angle"]
+    assert run(*common, "--candidates", files / "candidates.yaml", "--budget", "2 h") == 0
+    said = capsys.readouterr()
+    assert "temperature goes from 20 to 89.825 degC, the calibration only from 20 to 60 degC" in said.err
+    assert "bias value" in said.out
+    assert "Repeat the run." in said.out
+    assert "Best plan" in said.out
+    written = json.loads((files / "out" / "sensitivity.json").read_text(encoding="utf-8"))
+    angle = written["outcomes"]["angle"]
+    assert f"{angle['parameters'][0]['share'] * 100:.1f} %" in said.out
+    assert sum(row["share"] for row in angle["parameters"]) == pytest.approx(1.0)
+    assert {"warm", "cold"} >= set(written["plan"]["best"]["times"])
+    for name in ("tornado", "budget"):
+        assert "<svg" in (files / "out" / f"{name}.svg").read_text(encoding="utf-8")
+    assert run(*common[:3], "--outcome", "angle", "--json") == 0
+    again = json.loads(capsys.readouterr().out)
+    assert again["outcomes"] == written["outcomes"]
+
+
+@pytest.mark.parametrize(
+    ("model", "change", "more", "expected"),
+    [
+        ("bare", None, [], "no covariance"),
+        (
+            "model",
+            ("  temperature: [{for: 2000 s, from: 20 degC, to: 60 degC}]\n", ""),
+            [],
+            "instruments names temperature",
+        ),
+        ("model", ("temperature", "pressure"), [], "kPa"),
+        ("model", ("0.5 degC", "0.5 V"), [], "no size in a unit like degC"),
+        ("model", ("{temperature: 0.5 degC}", "{temperature: {often: 1 degC}}"), [], "common or independent"),
+        ("model", None, ["--outcome", "position"], "needs latitude_deg"),
+        ("model", None, ["--outcome", "speed"], "no outcome is called speed"),
+        ("model", None, ["--candidates", "PLAN", "--budget", "1 h"], "list of candidates"),
+        ("model", None, ["--candidates", "C", "--budget", "1 s"], "fits into"),
+        ("model", None, ["--candidates", "C", "--budget", "4"], "a time above zero"),
+    ],
+)
+def test_a_study_that_cannot_be_says_why(
+    files: Path, model: str, change: tuple[str, str] | None, more: list[str], expected: str,
+    capsys: pytest.CaptureFixture[str],
+):  # fmt: skip
+    (files / "bent.yaml").write_text(PLAN.replace(*change) if change else PLAN, encoding="utf-8")
+    more = [
+        str(files / {"PLAN": "plan.yaml", "C": "candidates.yaml"}.get(x, x)) if x in ("PLAN", "C") else x for x in more
+    ]
+    more = more if "--outcome" in more else [*more, "--outcome", "angle"]
+    assert run(files / f"{model}.yaml", "--plan", files / "bent.yaml", *more) == 1
+    said = capsys.readouterr().err
+    assert expected in said
+    assert said.count("\n") <= 2
+    assert "internal error" not in said
+
+
+def test_a_mission_that_lacks_a_column_says_which(files: Path, capsys: pytest.CaptureFixture[str]):
+    text = PLAN.replace("instruments: {temperature: 0.5 degC}\n", "").replace("  temperature:", "  pressure:")
+    (files / "bent.yaml").write_text(text.replace("degC", "kPa"), encoding="utf-8")
+    assert run(files / "model.yaml", "--plan", files / "bent.yaml") == 1
+    assert "needs a column temperature" in capsys.readouterr().err
+
+
+def test_one_budget_or_three():
+    with pytest.raises(ModelError, match="one calibrated model, or three"):
+        known([thermal(COVARIANCE)] * 2)
+    three = sensitivity([thermal(COVARIANCE)] * 3, mission(temperature=RAMP), ["rate"]).results[0].budget
+    assert {row.name for row in three.rows} >= {"x bias value", "z bias_temperature coefficient"}
+    one = sensitivity(thermal(COVARIANCE), mission(temperature=RAMP), ["rate"]).results[0].budget
+    assert three.std == pytest.approx(one.std)
+    assert sum(row.share for row in three.rows) == pytest.approx(1.0)
+
+
+def test_outcomes_of_the_catalogue_are_named_after_their_keys():
+    assert all(outcome.name == name for name, outcome in OUTCOMES.items())
