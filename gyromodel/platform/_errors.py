@@ -138,7 +138,7 @@ def drift_errors(
     )
 
 
-def pushes_at_rest(start: Navigation, steps: int, step: float) -> Float[Array, "step 3"]:
+def pushes_at_rest(start: Navigation, steps: int, step: Float[Array, ""] | float) -> Float[Array, "step 3"]:
     """Integral of the specific force (m/s) over each step of a body at rest over the Earth, in axes that keep still.
 
     Args:

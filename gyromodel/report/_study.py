@@ -9,6 +9,8 @@ import numpy as np
 from gyromodel.report import _drawing as draw
 from gyromodel.report._numbers import number, percent, unit_text, with_uncertainty
 
+from gyromodel.study import REPEATED
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
@@ -75,7 +77,8 @@ def sobol_rows(result: Result) -> list[tuple[str, ...]]:
 def test_rows(found: Sensitivity) -> list[tuple[str, ...]]:
     """What to do next and what it leaves of the first outcome: sentence, before, after."""
     budget = found.results[0].budget
-    return [(f"{t.std[budget.outcome]:.3g}", t.sentence) for t in found.tests[:TOLD]]
+    told = [t for i, t in enumerate(found.tests) if i < TOLD or t.sentence == REPEATED]
+    return [(f"{t.std[budget.outcome]:.3g}", t.sentence) for t in told]
 
 
 test_rows.__test__ = False  # pyright: ignore[reportFunctionMemberAccess]  pytest takes the name for a test's

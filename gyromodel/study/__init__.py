@@ -5,12 +5,13 @@ from gyromodel.study._draws import Drawn, Indices, sobol_indices, symmetric_fact
 from gyromodel.study._instruments import Instrument, read_instruments
 from gyromodel.study._known import Known, known
 from gyromodel.study._mission import OUTCOMES, Mission, Outcome
-from gyromodel.study._next import NextTest, covariance_after, information
+from gyromodel.study._next import REPEATED, NextTest, covariance_after, information
 from gyromodel.study._plan import Part, PlanChoice, TestPlan, best_plan, read_candidates, seconds
 from gyromodel.study._sensitivity import History, Result, Sensitivity, sensitivity
 
 __all__ = [
     "OUTCOMES",
+    "REPEATED",
     "Budget",
     "Drawn",
     "History",
