@@ -8,7 +8,6 @@ import numpy as np
 
 from gyromodel.report import _drawing as draw
 from gyromodel.report._numbers import number, percent, unit_text, with_uncertainty
-
 from gyromodel.study import REPEATED
 
 if TYPE_CHECKING:
