@@ -189,6 +189,7 @@ def test_effects_as_json(run: Run):
     assert {"equation", "needs", "cause", "test", "parameters"} <= set(one)
 
 
+@pytest.mark.long
 def test_plan_tells_what_could_be_told_apart(tmp_path: Path, run: Run):
     """One ramp: temperature and time are one line, which the table, the tests and the JSON form all say."""
     (tmp_path / "plan.yaml").write_text(
