@@ -369,18 +369,25 @@ def units(
 @app.command()
 def export(
     model: Annotated[Path, typer.Argument(metavar="M.yaml", help="A model with values.")],
-    to: Annotated[Literal["c", "json", "csv"], typer.Option("--to", help="C99 source, JSON, or CSV.")],
+    to: Annotated[
+        Literal["c", "json", "csv", "px4"], typer.Option("--to", help="C99 source, JSON, CSV, or PX4 parameters.")
+    ],
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="File to write; printed without.")
     ] = None,
+    axis: Axis = None,
 ) -> None:
-    """Write a calibration for firmware and spreadsheets."""
+    """Write a calibration for firmware and spreadsheets; to PX4, that of one axis."""
+    if (to == "px4") != (axis is not None):
+        raise typer.BadParameter(
+            "PX4 parameters, and these alone, are of one axis: --to px4 --axis x", param_hint="--axis"
+        )
     if output:
         refuse_overwriting(output, [model])
     from gyromodel.export import export_calibration
     from gyromodel.model_files import read_calibration
 
-    text = export_calibration(read_calibration(model), to)
+    text = export_calibration(read_calibration(model), to, axis or "x")
     if output:
         write_text(output, text)
     else:
