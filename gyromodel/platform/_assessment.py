@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from itertools import permutations
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,7 +27,7 @@ SUPPORTED = 6.0
 RIVALS = 3
 FURTHER = (40.0, 60.0, 80.0, 100.0, 140.0)
 # Standard deviations between predictions with which 5 % of repetitions at most prefer the wrong one.
-TOLD_APART = 3.3
+TOLD_APART, USELESS = 3.3, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,8 @@ class VibrationTest:
         scatter_stated: whether explanations were judged by the responses' own standard errors; where these exclude
             every one, the scatter is what each of them leaves.
         supported: explanations that are not excluded and not far behind, best first.
-        further: of further tests of all axes, the least separation of any two of the first supported ones.
+        further: of further tests of all axes, the least separation of any two of the first supported ones, in standard
+            deviations.
     """
 
     responses: tuple[Response, ...]
@@ -57,7 +58,8 @@ class VibrationTest:
     def next_test(self) -> str | None:
         """The first further test that tells the supported explanations apart, else the one that comes nearest."""
         enough = [name for name, apart in self.further.items() if apart >= TOLD_APART]
-        return next(iter(enough), max(self.further, key=lambda name: self.further[name], default=None))
+        best = max(self.further, key=lambda name: self.further[name], default=None)
+        return next(iter(enough), best if best and self.further[best] > USELESS else None)
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -173,7 +175,7 @@ def _explained(at: Points, found: list[Response], known: bool) -> dict[str, Expl
             explanations[name] = explain(alternative, at, gain, phase, phase_std=phase_std, gain_std=gain_std)
         except EstimateError:
             continue  # too few points for it
-    return explanations
+    return {name: e for name, e in explanations.items() if e.degrees_of_freedom > 0}
 
 
 def _further(rivals: dict[str, Explanation], at: Points, integrated: float) -> dict[str, float]:
@@ -188,15 +190,11 @@ def _further(rivals: dict[str, Explanation], at: Points, integrated: float) -> d
     tests["the same at half the amplifier gain"] = at._replace(amplifier=0.5 * at.amplifier)
     if not integrated:
         tests["the same, gyros logged"] = at._replace(integrated=np.ones_like(at.integrated))
-    apart = {}
-    for name, test in tests.items():
-        pairs = permutations(rivals, 2)
-        each = []
-        for one, other in pairs:
-            try:
-                each.append(separation(rivals[one], ALTERNATIVES[other], at, test, signed=True))
-            except EstimateError:
-                continue
-        if each:
-            apart[name] = min(each)
-    return apart
+    return {
+        name: min(_apart(*pair, at, test) for pair in combinations(rivals.values(), 2)) for name, test in tests.items()
+    }
+
+
+def _apart(one: Explanation, other: Explanation, at: Points, test: Points) -> float:
+    """By how much either misses the other; one that contains the other never misses it."""
+    return max(separation(a, b.alternative, at, test, signed=True) for a, b in ((one, other), (other, one)))

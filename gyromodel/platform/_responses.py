@@ -23,6 +23,8 @@ from gyromodel.platform._vibration import DECIBELS, published_response
 DEGREE, HARMONICS = 3, 3
 # Cosines that tell the noise, those nearest to the frequency, half a cycle of the record apart; and steps of its fit.
 MODES, STEPS = 120, 200
+# Frequencies tried on either side of a peak, in quarters of a cycle of the record.
+TRIED = 8
 # Degrees of freedom that an interval has at least; with kinds of noise that cannot be told apart the estimate is lower.
 LEAST_FREEDOM = 4.0
 # Samples that a sine, its overtones and a drift leave enough of.
@@ -206,11 +208,15 @@ def _frequency(
 ) -> tuple[float, float]:
     """Of least squares of the table alone, which no drift of gyros disturbs, and its standard error."""
 
-    def left(w: float) -> np.ndarray:
+    def left(w: float, degree: int = degree, harmonics: int = harmonics) -> np.ndarray:
         columns = _columns(time, w, degree, harmonics)
         return y - columns @ np.linalg.lstsq(columns, y, rcond=None)[0]
 
-    near = (max(start - 2 * np.pi / length, 0.25 * start), start + 2 * np.pi / length)
+    # First without overtones, whose presence would let a fraction of the frequency pass for it.
+    tried = start + np.pi / (2 * length) * np.arange(-TRIED, TRIED + 1)
+    tried = tried[tried > 0.5 * np.pi / length]
+    start = tried[np.argmin([np.sum(left(w, 1, 1) ** 2) for w in tried])]
+    near = max(start - 0.5 * np.pi / length, 0.5 * start), start + 0.5 * np.pi / length
     options = {"xatol": 1e-8 / length}
     found: Any = minimize_scalar(lambda w: np.sum(left(w) ** 2), bounds=near, method="bounded", options=options)
     w, nudge = float(found.x), 1e-3 / length

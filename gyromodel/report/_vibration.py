@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 _COLOURS = {"X": draw.AFTER, "Y": draw.MARK, "Z": draw.INK}
 _MARKERS = {"X": "o", "Y": "s", "Z": "^"}
 _DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)))
-# Explanations whose curves are drawn, and rad/s up to which.
-_DRAWN, _HIGHEST = 3, 300.0
+# Explanations whose curves are drawn, rad/s up to which, and by how many spans of the points they may leave the frame.
+_DRAWN, _HIGHEST, _BEYOND = 3, 140.0, 3.0
 _QUANTITIES = ("gain", "phase")
 _LABELS = ("amplitude ratio (dB)", "phase (deg)")
 
@@ -72,10 +72,12 @@ def _lines(test: VibrationTest) -> list[str]:
         lines.append(f"- {name}: {values or 'nothing of it is seen'}.")
     rest = len(test.explanations) - len(test.supported)
     lines.append(f"{rest} others are {'excluded or ' if test.scatter_stated else ''}far less likely (vibration.json).")
+    lines.append("Values hold for the loop that each explanation assumes, the first one's in loop.svg.")
     if test.next_test:
-        apart = test.further[test.next_test]
-        lines.append(f"These cannot be told apart. One more test of all axes, {test.next_test}, sets them {apart:.1f} "
-                     "standard deviations apart (3.3 are enough).")  # fmt: skip
+        apart = f"{test.further[test.next_test]:.1f} standard deviations apart (3.3 are enough)"
+        lines.append(f"These cannot be told apart. One more test, {test.next_test}, all axes, sets them {apart}.")
+    elif len(test.supported) > 1:
+        lines.append("These cannot be told apart, nor by any further test tried.")
     return lines
 
 
@@ -173,7 +175,10 @@ def _explanations(test: VibrationTest) -> str:
         column[0].set_title(f"axis {axis}", fontsize=10.5, color=draw.INK)
         column[1].set_xlabel("frequency (rad/s)")
         column[1].xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    for k in range(2):
+    for k, quantity in enumerate(_QUANTITIES):
+        ends = np.array([getattr(r, f"{quantity}_interval") for r in test.responses])
+        room = _BEYOND * np.ptp(ends)
+        grid[k, 0].set_ylim(ends.min() - room, ends.max() + room)
         grid[k, 0].set_ylabel(_LABELS[k])
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles[: len(shown)], labels[: len(shown)], loc="outside upper left", ncols=1, frameon=False)
@@ -202,9 +207,9 @@ def _loop(test: VibrationTest) -> str:
         axes.axvline(found.crossover, color=draw.MUTED, linewidth=0.9, linestyle=(0, (4, 3)))
         axes.set_ylabel(label)
         axes.set_xscale("log")
-        axes.legend(loc="upper right", frameon=False)
+        axes.legend(loc="lower left", frameon=False)
     read = f"crossover {found.crossover:.0f}, bandwidth {found.bandwidth:.0f} rad/s"
-    top.set_title(f"the loop that the first explanation assumes: {read}", fontsize=10.5, color=draw.INK)
+    top.set_title(f"loop assumed: {read}", fontsize=10.5, color=draw.INK)
     bottom.set_xlabel("frequency (rad/s)")
     bottom.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     return draw.rendered(figure, "loop")
