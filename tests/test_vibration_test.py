@@ -14,6 +14,7 @@ from scipy.stats import binom, kstest
 
 import gyromodel
 from gyromodel import CampaignError, cli
+from gyromodel._console import print_table
 from gyromodel.campaign import Campaign
 from gyromodel.files import read_campaign, write_campaign
 from gyromodel.platform import (
@@ -31,6 +32,7 @@ from gyromodel.platform import (
     responses,
     vibration_test,
 )
+from gyromodel.report import vibration_words, with_uncertainty
 
 LOG = Path(gyromodel.__file__).parent / "data" / "platform_vibration.csv.gz"
 SECOND = np.deg2rad(1 / 3600)
@@ -129,6 +131,16 @@ def test_the_embedded_log(demo: VibrationTest):
     assert values["friction over inertia X"] == pytest.approx(0.5 / 0.45 * 210 / 220, rel=0.25)
     assert values["friction over inertia Z"] == pytest.approx(0.5 / 0.56 * 210 / 220, rel=0.25)
     assert values["corner"] == pytest.approx(30.0, rel=0.25)
+
+
+def test_the_readme_prints_what_the_command_does(demo: VibrationTest, capsys: pytest.CaptureFixture[str]):
+    readme = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
+    words = vibration_words(demo)
+    print_table(words.head, words.runs)
+    assert "\n".join(capsys.readouterr().out.splitlines()[:5]) in readme
+    rows = {row.name: row for row in parameters(demo.explanations[demo.supported[0]])}
+    for name in ("time offset", "friction over inertia X", "friction over inertia Z"):
+        assert with_uncertainty(rows[name].value, rows[name].std, rows[name].unit) in readme
 
 
 def test_one_axis_at_two_frequencies_tells_less():

@@ -38,6 +38,8 @@ AMPLITUDE = np.deg2rad(0.15)
 ROUNDS, SETTLED = 200, 1e-9
 # Relative size of a singular value of the scaled Jacobian below which the points do not determine an alternative.
 SINGULAR = 1e-9
+# A standard uncertainty this many times the larger of a parameter's value and its start is no estimate.
+RUNAWAY = 100.0
 # Loops of the published bandwidth other than the default one: with as much integration as margins of 45° allow, and
 # with two integrators.
 QUICK = {"correction": 5.0, "corner": 120.0}
@@ -341,6 +343,9 @@ def _fitted(columns: np.ndarray, data: _Data, measured: np.ndarray, std: np.ndar
         scatter = np.maximum(scatter, 1e-12)
         if np.all(np.abs(scatter - before) < SETTLED * before):
             break
-    spread = columns @ ((right.T / singular) / norm[:, None])
+    spread = (right.T / singular) / norm[:, None]
+    if (np.linalg.norm(spread, axis=1) > RUNAWAY * np.maximum(np.abs(x), columns.T @ SIZES / counts)).any():
+        raise EstimateError("the points of the vibration test do not determine this explanation")
+    spread = columns @ spread
     squares = float(np.sum((residual / (std * scatter[groups])) ** 2))
     return _Fit(columns @ x, np.linalg.norm(spread, axis=1), scatter, residual, squares)

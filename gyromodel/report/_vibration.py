@@ -191,25 +191,30 @@ def _loop(test: VibrationTest) -> str:
     response = np.asarray(loop.open_loop(jnp.asarray(grid)))
     size, phase = 20 * np.log10(np.abs(response)), np.rad2deg(np.unwrap(np.angle(response)))
     phase -= 360 * np.round((phase[0] + 180) / 360)
-    found = margins(loop)
     figure, panels = _two(6.6, 5.2)
     top, bottom = panels[:, 0]
-    top.plot(grid, size, color=draw.AFTER, linewidth=1.8)
-    bottom.plot(grid, phase, color=draw.AFTER, linewidth=1.8)
-    turning = grid[np.argmax(size < -found.gain)]
-    top.plot(
-        [turning, turning], [0, -found.gain], color=draw.MARK, linewidth=2, label=f"gain margin {found.gain:.0f} dB"
-    )
-    bottom.plot([found.crossover] * 2, [-180, found.phase - 180], color=draw.MARK, linewidth=2,
-                label=f"phase margin {found.phase:.0f}°")  # fmt: skip
-    for axes, level, label in ((top, 0.0, "open loop (dB)"), (bottom, -180.0, "open loop (deg)")):
+    for axes, curve, level, label in (
+        (top, size, 0.0, "open loop (dB)"),
+        (bottom, phase, -180.0, "open loop (deg)"),
+    ):
+        axes.plot(grid, curve, color=draw.AFTER, linewidth=1.8)
         axes.axhline(level, color=draw.MUTED, linewidth=0.9)
-        axes.axvline(found.crossover, color=draw.MUTED, linewidth=0.9, linestyle=(0, (4, 3)))
         axes.set_ylabel(label)
         axes.set_xscale("log")
-        axes.legend(loc="lower left", frameon=False)
-    read = f"crossover {found.crossover:.0f}, bandwidth {found.bandwidth:.0f} rad/s"
-    top.set_title(f"loop assumed: {read}", fontsize=10.5, color=draw.INK)
     bottom.set_xlabel("frequency (rad/s)")
     bottom.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    try:
+        found = margins(loop)
+    except ValueError:
+        top.set_title("loop assumed: it has no margins", fontsize=10.5, color=draw.INK)
+        return draw.rendered(figure, "loop")
+    turning, marked = grid[np.argmax(size < -found.gain)], {"color": draw.MARK, "linewidth": 2}
+    top.plot([turning] * 2, [0, -found.gain], label=f"gain margin {found.gain:.0f} dB", **marked)
+    ends = [-180, found.phase - 180]
+    bottom.plot([found.crossover] * 2, ends, label=f"phase margin {found.phase:.0f}°", **marked)
+    read = f"crossover {found.crossover:.0f}, bandwidth {found.bandwidth:.0f} rad/s"
+    top.set_title(f"loop assumed: {read}", fontsize=10.5, color=draw.INK)
+    for axes in (top, bottom):
+        axes.axvline(found.crossover, color=draw.MUTED, linewidth=0.9, linestyle=(0, (4, 3)))
+        axes.legend(loc="lower left", frameon=False)
     return draw.rendered(figure, "loop")
