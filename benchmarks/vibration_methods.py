@@ -104,10 +104,10 @@ def main() -> None:
     argv = sys.argv[1:]
     lines = [
         f"A platform without friction on a table at ±{AMPLITUDE}° about X, so that the true response is 0 dB and 0°. "
-        f"At 100 Hz, encoders of 20 bit with {NOISE:g} arcsec of noise besides, gyros of 0.005 deg/√h, latitude 40°. Root "
-        f"mean square errors of {SEEDS} runs. Drift is that of the gyros at the start, and grows by as much in 20 s; "
-        "it is not logged. Trend: a parabola is taken off the angle of the gimbal that moves most, then sines are fitted. "
-        "Band-pass: Butterworth of second order from half to twice the frequency, forth and back, on that gimbal and "
+        f"At 100 Hz, encoders of 20 bit with {NOISE:g} arcsec of noise besides, gyros of 0.005 deg/√h, latitude 40°. "
+        f"Root mean square errors of {SEEDS} runs. Drift is that of the gyros at the start, and grows by as much in 20 s; "
+        "it is not logged. Trend: a parabola is taken off the angle of the gimbal that moves most, then sines are "
+        "fitted. Band-pass: Butterworth of second order from half to twice the frequency, forth and back, on that gimbal and "
         "the table. Navigation: base angles of `base_motion`, by the published correlations over whole periods, and as "
         "`gyromodel vibration` does.",
         "",
