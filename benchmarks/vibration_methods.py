@@ -31,7 +31,7 @@ HEAD = [
 
 
 def campaigns(start, drifts, duration):
-    """(frequency, drift, campaign) of every run about X, and how long they are."""
+    """(frequency, drift, campaign) of every run about Z, the horizontal axis to the north."""
     from gyromodel.campaign import Campaign
     from tests.truth import platform
     from tests.truth.platform_campaign import GIMBALS
@@ -46,7 +46,7 @@ def campaigns(start, drifts, duration):
     design = platform.Platform(
         viscous=np.zeros(4), coulomb=np.zeros(4), drift=drift, noise=np.deg2rad(0.005) / 60, quantum=2 * np.pi / 2**20
     )
-    amplitude = np.tile(np.deg2rad([AMPLITUDE, 0.0, 0.0]), (len(cases), 1))
+    amplitude = np.tile(np.deg2rad([0.0, 0.0, AMPLITUDE]), (len(cases), 1))
     frequency = np.array([w for w, _ in cases])[:, None] * np.ones(3)
     run, rng = platform.simulate(design, amplitude, frequency, duration, start), np.random.default_rng(0)
     names = ["time", "table_x", "table_y", "table_z", *GIMBALS]
@@ -65,7 +65,7 @@ def estimates(campaign, w):
     from gyromodel.platform import base_motion, fit_sines, responses
 
     motion = base_motion(campaign)
-    time, y = motion.time, motion.table[:, 0]
+    time, y = motion.time, motion.table[:, 2]
     # The gimbal that moves most at the frequency, counted in the table's sense.
     basis = np.column_stack([np.sin(w * time), np.cos(w * time), time, np.ones_like(time)])
     waves = np.linalg.lstsq(basis, np.column_stack([y, motion.gimbals]), rcond=None)[0][:2]
@@ -103,13 +103,13 @@ def rows(start, drifts, durations):
 def main() -> None:
     argv = sys.argv[1:]
     lines = [
-        f"A platform without friction on a table at ±{AMPLITUDE}° about X, so that the true response is 0 dB and 0°. "
-        f"At 100 Hz, encoders of 20 bit with {NOISE:g} arcsec of noise besides, gyros of 0.005 deg/√h, latitude 40°. "
-        f"Root mean square errors of {SEEDS} runs. Drift is that of the gyros at the start, and grows by as much in 20 s; "
-        "it is not logged. Trend: a parabola is taken off the angle of the gimbal that moves most, then sines are "
-        "fitted. Band-pass: Butterworth of second order from half to twice the frequency, forth and back, on that gimbal and "
-        "the table. Navigation: base angles of `base_motion`, by the published correlations over whole periods, and as "
-        "`gyromodel vibration` does.",
+        f"A platform without friction on a table at ±{AMPLITUDE}° about Z, to the north, so that the response is 0 "
+        f"dB and 0°. At 100 Hz, encoders of 20 bit with {NOISE:g} arcsec of noise besides, gyros of 0.005 deg/√h, "
+        f"latitude 40°. Root mean square errors of {SEEDS} runs. Drift is that of the gyros at the start, and grows"
+        " by as much in 20 s; it is not logged. Trend: a parabola is taken off the angle of the gimbal that moves "
+        "most, then sines are fitted. Band-pass: Butterworth of second order from half to twice the frequency, "
+        "forth and back, on that gimbal and the table. Navigation: base angles of `base_motion`, by the published "
+        "correlations over whole periods, and as `gyromodel vibration` does.",
         "",
         "## Gimbals near zero",
         "",
