@@ -10,7 +10,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import binom, kstest
+from scipy.stats import binom, chi2, kstest
 
 import gyromodel
 from gyromodel import CampaignError, cli
@@ -81,8 +81,10 @@ def test_intervals_hold_in_noise_of_any_colour(kind: str, w: float, rng: np.rand
         assert np.sum((ends[:, 0] <= true) & (true <= ends[:, 1])) >= least
         errors = np.array([getattr(r, name) for r in found]) - true
         stated = np.array([getattr(r, f"{name}_std") for r in found])
-        # Not wider than they need be: encoders' steps are allowed for at their worst.
-        assert np.sqrt(np.mean(stated**2)) < (4 if kind == "quantised" else 1.6) * np.sqrt(np.mean(errors**2))
+        # Not much wider than they need be: 1.3 times, and the rms of 50 errors is 0.66 of its mean at least (χ² law). An
+        # encoder's steps are allowed for at their worst.
+        wide = 4.0 if kind == "quantised" else 1.3 / np.sqrt(chi2.ppf(1e-4, runs) / runs)
+        assert np.sqrt(np.mean(stated**2)) < wide * np.sqrt(np.mean(errors**2))
 
 
 def test_the_same_sines_as_at_the_known_frequency(rng: np.random.Generator):
