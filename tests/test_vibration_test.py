@@ -81,7 +81,7 @@ def test_intervals_hold_in_noise_of_any_colour(kind: str, w: float, rng: np.rand
         assert np.sum((ends[:, 0] <= true) & (true <= ends[:, 1])) >= least
         errors = np.array([getattr(r, name) for r in found]) - true
         stated = np.array([getattr(r, f"{name}_std") for r in found])
-        # Not much wider than they need be: 1.3 times, and the rms of 50 errors is 0.66 of its mean at least (χ² law). An
+        # Not much wider than they need be: 1.3 times, with the rms of 50 errors as small as the χ² law allows. An
         # encoder's steps are allowed for at their worst.
         wide = 4.0 if kind == "quantised" else 1.3 / np.sqrt(chi2.ppf(1e-4, runs) / runs)
         assert np.sqrt(np.mean(stated**2)) < wide * np.sqrt(np.mean(errors**2))
