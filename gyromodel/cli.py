@@ -421,6 +421,33 @@ def allan(
 
 
 @app.command()
+def vibration(
+    campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Log of a platform on a vibration table.")],
+    output: Folder,
+    as_json: AsJson = False,
+) -> None:
+    """Amplitude and phase of a gyro-stabilised platform on an angular vibration table, and what explains them."""
+    from gyromodel.platform import vibration_test
+    from gyromodel.report import vibration_figures, vibration_words
+
+    [measured] = read_campaigns([campaign], None)
+    with progress_bar() as progress:
+        test = vibration_test(measured, progress)
+    result, figures = test.to_dict(), vibration_figures(test)
+    output.mkdir(parents=True, exist_ok=True)
+    write_text(output / "vibration.json", json_text(result))
+    for name, figure in figures.items():
+        write_text(output / f"{name}.svg", figure)
+    if as_json:
+        print(json_text(result), end="")
+        return
+    words = vibration_words(test)
+    print_table(words.head, words.runs)
+    print("".join(f"\n{line}" for line in words.lines))
+    print_paths(output, "vibration.json", *(f"{name}.svg" for name in figures))
+
+
+@app.command()
 def effects(
     effect: Annotated[str | None, typer.Argument(metavar="ID", help="One effect, in full.", show_default=False)] = None,
     as_json: AsJson = False,
