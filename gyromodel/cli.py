@@ -48,7 +48,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")  # an equation's ε must not stop a terminal that lacks it
-    keep_compiled()
+    if not {"--help", "--version"} & {*(sys.argv[1:] if arguments is None else arguments)}:
+        keep_compiled()
     try:
         typer.main.get_command(app)(args=arguments, prog_name="gyromodel")
     except Exception as error:
