@@ -56,8 +56,8 @@ def test_a_body_over_one_place_stays_there(turning: float, tmp_path: Path, capsy
 
 
 def in_other_unit(campaign: Campaign, columns: str, unit: str, kind: str) -> Campaign:
-    units = campaign.units | {n: unit for n in campaign.columns if n.startswith(columns)}
-    return Campaign(campaign.columns, units, campaign.metadata | {"kind": kind})
+    units = dict(campaign.units) | {n: unit for n in campaign.columns if n.startswith(columns)}
+    return Campaign(campaign.columns, units, dict(campaign.metadata) | {"kind": kind})
 
 
 def upside_down(campaign: Campaign) -> Campaign:
