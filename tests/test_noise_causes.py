@@ -165,3 +165,15 @@ def test_kinds_of_noise_that_are_not_stated_are_causes():
         free = gm.diagnose(log(output), gm.model_from_effects(["bias"]), hold_out=False)
         assert [c.effect for c in free.causes] == ([name] if name == "noise_telegraph" else [])
         assert any(sentence in line for line in (*free.findings, ""))
+
+
+def test_a_ripple_at_one_end_of_a_column_is_told_beside_the_noise(rng: np.random.Generator):
+    """A sine of 1 °C period is no function that is searched, and scatters like noise of the hot end."""
+    time = STEP * np.arange(ROWS)
+    temperature = 20.0 + 20.0 * np.sin(2 * np.pi * time / time[-1] * 2.1)
+    level = 4.0 * WHITE / np.sqrt(STEP) * ((temperature - temperature.min()) / np.ptp(temperature)) ** 2
+    for extra, told in ((np.sin(6.0 * temperature + rng.uniform(0, 6)), True), (rng.standard_normal(ROWS), False)):
+        measured = log(white(rng) + level * extra).with_column("temperature", temperature, "degC")
+        found = gm.diagnose(measured, gm.model_from_effects(["bias"]), hold_out=False)
+        assert any("noise level follows temperature" in line for line in found.findings)
+        assert any("temperature follow one another" in line for line in found.findings) == told
