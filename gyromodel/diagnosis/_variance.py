@@ -102,7 +102,7 @@ def with_variance(record: Record, white: np.ndarray) -> Record:
 
 
 def follow(estimate: Estimate, grows: Growth) -> str | None:
-    """A sentence where residuals of a high level follow one another in time or along the driver, as noise never does."""
+    """A sentence where residuals of a high level follow one another, in time or along the driver, as noise does not."""
     white = grows.white[: estimate.record.rows]
     high = np.flatnonzero(np.isfinite(estimate.whitened) & (white > np.median(white)))
     for order in (high, high[np.argsort(white[high], kind="stable")]):
