@@ -184,7 +184,8 @@ def diagnose(
             "Parameters weigh all samples alike: that predicts left-out blocks better than the fitted noise's weights "
             "do."
         )
-    judgement = judge(record, session.scanner, baseline, selection, extended, len(bank.names()), nulls)
+    given_whole = [(c, c is m) for (c, _), m in zip(shortened, measured, strict=True)]
+    judgement = judge(record, session.scanner, baseline, selection, extended, len(bank.names()), nulls, given_whole)
     stepped = None
     if not _unfinished(selection) and (free := _with_noise_estimated(selection.estimate)):
         stepped = quantisation(free, session.threshold)
