@@ -17,11 +17,13 @@ from scipy.signal import lfilter
 from scipy.special import gammaln
 
 import gyromodel as gm
+from gyromodel.averages import average
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores
 from gyromodel.diagnosis._evidence import SIZES, explained_for, log_evidence_ratio
 from gyromodel.diagnosis._ranking import rank
 from gyromodel.diagnosis._scan import Scanner
+from gyromodel.diagnosis._verdict import _places
 from gyromodel.estimate import EstimateError, fit_record
 from gyromodel.model import record_span
 from gyromodel.noise import NoiseGrid, NoiseRatios, markov_sum
@@ -322,6 +324,16 @@ def test_many_gross_errors_are_given_up_together(rng: np.random.Generator) -> No
     assert [c.effect for c in found.causes] == ["bias_temperature"]
     rows = ", ".join(str(row + 1) for row in wild[:12])
     assert f"20 gross errors in data rows {rows}…: given up, not modelled." in found.findings
+
+
+def test_a_gross_error_is_told_where_it_is_in_its_file(rng: np.random.Generator) -> None:
+    first, second = static_log(rng), static_log(rng, np.where(np.arange(ROWS) == 100, 40.0, 0.0))
+    second = gm.Campaign(second.columns, second.units, second.metadata, name="second")
+    found = gm.diagnose([first, second], gm.model_from_effects(["bias"]), hold_out=False)
+    assert "A gross error in data row 101 of second: given up, not modelled." in found.findings
+    halved, together = average(second, ROWS // 2)
+    assert together == 2
+    assert _places([50, 52], [(halved, False)]) == "at 2010 s, 2090 s"
 
 
 def test_many_steps_are_a_function_of_time_and_no_cause(rng: np.random.Generator) -> None:

@@ -53,7 +53,7 @@ def published_response(
     """
     a, b = (jnp.sqrt(2 * (jnp.mean(x**2, -1) - v)) for x, v in ((base, base_variance), (table, table_variance)))
     cosine = 2 * jnp.mean(base * table, -1) / (a * b)
-    phase = jnp.where(cosine <= 1 + ROUNDING, jnp.arccos(jnp.clip(cosine, -1.0, 1.0)), jnp.nan)
+    phase = jnp.where(jnp.abs(cosine) <= 1 + ROUNDING, jnp.arccos(jnp.clip(cosine, -1.0, 1.0)), jnp.nan)
     return PublishedResponse(DECIBELS * jnp.log(a / b), jnp.rad2deg(phase))
 
 
