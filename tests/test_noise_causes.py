@@ -178,3 +178,6 @@ def test_a_ripple_at_one_end_of_a_column_is_told_beside_the_noise(rng: np.random
         found = gm.diagnose(measured, gm.model_from_effects(["bias"]), hold_out=False)
         assert any("noise level follows temperature" in line for line in found.findings)
         assert any("temperature follow one another" in line for line in found.findings) == told
+        assert (found.verdict, found.driver and found.driver.column) == (
+            ("unknown", "temperature") if told else ("adequate", None)
+        )

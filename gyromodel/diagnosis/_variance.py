@@ -9,6 +9,7 @@ import numpy as np
 from scipy import stats
 
 from gyromodel.campaign import Campaign
+from gyromodel.declarations import RATE_OF
 from gyromodel.estimate import Estimate
 from gyromodel.noise_analysis import quantum
 from gyromodel.signals import Record
@@ -58,6 +59,11 @@ class Growth(NamedTuple):
     ratio: float
     ratio_std: float
     evidence: float
+
+    @property
+    def column(self) -> str:
+        """What the driver is made of."""
+        return RATE_OF.format("temperature") if "temperature rate" in self.driver else self.driver.strip("|")
 
 
 def growing_noise(record: Record, estimate: Estimate) -> Growth | None:

@@ -190,6 +190,14 @@ def _places(rows: Sequence[int], searched: Sequence[tuple[Campaign, bool]]) -> s
     return f"{how} {', '.join(some)}{'…' if len(rows) > ROWS_TOLD else ''}"
 
 
+def structured(judgement: Judgement, ranking: Ranking, column: str) -> Judgement:
+    """The judgement where what passes for noise at one end of a column has a structure that nothing searched has."""
+    name = f"smooth({column})"
+    driver = name if name in ranking.statistic else None
+    test = f"Repeat the campaign over that end of {column} alone, sampled more densely: what returns there is no noise."
+    return replace(judgement, verdict="unknown", credible_set={name: 1.0}, driver=driver, next_test=test)
+
+
 def with_noise(judgement: Judgement, beyond: Sequence[Cause], trials: int) -> Judgement:
     """The judgement with kinds of noise that the simulation lacks beside what else it lacks."""
     if not beyond:
