@@ -48,7 +48,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")  # an equation's ε must not stop a terminal that lacks it
-    keep_compiled()
+    if not {"--help", "--version"} & {*(sys.argv[1:] if arguments is None else arguments)}:
+        keep_compiled()
     try:
         typer.main.get_command(app)(args=arguments, prog_name="gyromodel")
     except Exception as error:
@@ -421,18 +422,25 @@ def units(
 @app.command()
 def export(
     model: Annotated[Path, typer.Argument(metavar="M.yaml", help="A model with values.")],
-    to: Annotated[Literal["c", "json", "csv"], typer.Option("--to", help="C99 source, JSON, or CSV.")],
+    to: Annotated[
+        Literal["c", "json", "csv", "px4"], typer.Option("--to", help="C99 source, JSON, CSV, or PX4 parameters.")
+    ],
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="File to write; printed without.")
     ] = None,
+    axis: Axis = None,
 ) -> None:
-    """Write a calibration for firmware and spreadsheets."""
+    """Write a calibration for firmware and spreadsheets; to PX4, that of one axis."""
+    if (to == "px4") != (axis is not None):
+        raise typer.BadParameter(
+            "PX4 parameters, and these alone, are of one axis: --to px4 --axis x", param_hint="--axis"
+        )
     if output:
         refuse_overwriting(output, [model])
     from gyromodel.export import export_calibration
     from gyromodel.model_files import read_calibration
 
-    text = export_calibration(read_calibration(model), to)
+    text = export_calibration(read_calibration(model), to, axis or "x")
     if output:
         write_text(output, text)
     else:
@@ -463,6 +471,33 @@ def allan(
     print_table(("noise", "", "value", "95 % from", "to", "unit", "verdict"), noise_rows(analysis))
     print("".join(f"\n{remark}\n" for remark in analysis.remarks), end="")
     print_paths(output, "allan.json", "allan.svg")
+
+
+@app.command()
+def vibration(
+    campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Log of a platform on a vibration table.")],
+    output: Folder,
+    as_json: AsJson = False,
+) -> None:
+    """Amplitude and phase of a gyro-stabilised platform on an angular vibration table, and what explains them."""
+    from gyromodel.platform import vibration_test
+    from gyromodel.report import vibration_figures, vibration_words
+
+    [measured] = read_campaigns([campaign], None)
+    with progress_bar() as progress:
+        test = vibration_test(measured, progress)
+    result, figures = test.to_dict(), vibration_figures(test)
+    output.mkdir(parents=True, exist_ok=True)
+    write_text(output / "vibration.json", json_text(result))
+    for name, figure in figures.items():
+        write_text(output / f"{name}.svg", figure)
+    if as_json:
+        print(json_text(result), end="")
+        return
+    words = vibration_words(test)
+    print_table(words.head, words.runs)
+    print("".join(f"\n{line}" for line in words.lines))
+    print_paths(output, "vibration.json", *(f"{name}.svg" for name in figures))
 
 
 @app.command()

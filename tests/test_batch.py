@@ -181,6 +181,7 @@ def test_a_full_disk_leaves_what_is_there(tmp_path: Path, monkeypatch: pytest.Mo
     assert here(tmp_path).campaigns == 4
 
 
+@pytest.mark.long
 def test_a_worker_that_dies_loses_nothing(tmp_path: Path):
     """Of a local cluster of two processes, one is killed when the first results are there."""
     archive(tmp_path, 24)
@@ -250,6 +251,7 @@ def test_axes_and_diagnoses(tmp_path: Path):
     assert any(r["parameter"] == "bias_temperature.coefficient" for r in rows)
 
 
+@pytest.mark.long
 def test_a_scheduler_that_is_not_there_is_said(tmp_path: Path):
     archive(tmp_path, 1)
     status, result = batch(tmp_path, "--scheduler", "tcp://127.0.0.1:9")

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         test_rows,
         tornado_figure,
     )
+    from gyromodel.report._vibration import vibration_figures, vibration_words
 
 __all__ = [
     "deviation_figure",
@@ -35,6 +36,8 @@ __all__ = [
     "sobol_rows",
     "test_rows",
     "tornado_figure",
+    "vibration_figures",
+    "vibration_words",
     "with_uncertainty",
     "write_report",
 ]
@@ -44,5 +47,6 @@ def __getattr__(name: str) -> Any:
     """What needs NumPy and JAX is imported when it is used: a sentence does not."""
     if name not in __all__:
         raise AttributeError(f"module 'gyromodel.report' has no attribute {name!r}")
-    room = "_deviation" if name in ("deviation_figure", "noise_rows") else "_study"
-    return getattr(import_module(f"gyromodel.report.{room}"), name)
+    rooms = {"noise_rows": "_deviation", "deviation_figure": "_deviation"}
+    rooms |= {"vibration_figures": "_vibration", "vibration_words": "_vibration"}
+    return getattr(import_module(f"gyromodel.report.{rooms.get(name, '_study')}"), name)
