@@ -57,6 +57,8 @@ def mission(
 RAMP = np.linspace(20.0, 60.0, ROWS)
 THERMAL = (Bias(value=2 * DEG_H), BiasTemperature(coefficient=0.1 * DEG_H, reference=20.0))
 NOISE = {"noise_white": WHITE, "noise_random_walk": WALK}
+# Of the same structure, so that one compiled program serves both.
+WHITE_ALONE = NOISE | {"noise_random_walk": 0.0}
 
 
 def thermal(covariance: np.ndarray, noise: dict[str, float] | None = None) -> Calibration:
@@ -142,14 +144,15 @@ def test_an_outcome_that_bends_is_found_out(seed: int):
 
 def test_stages_are_kept_apart():
     """Two sources with variances 1 and 3."""
-    model = GyroModel(THERMAL[:1], NOISE)
-    first = Uncertain.stated(jnp.zeros(1), 1.0, "rate table")
-    second = Uncertain.stated(jnp.zeros(1), 3.0, "chamber")
+    model = GyroModel(THERMAL, NOISE)
+    first = Uncertain.stated(jnp.zeros(2), np.array([1.0, 0.0]), "rate table")
+    second = Uncertain.stated(jnp.zeros(2), np.array([3.0, 0.0]), "chamber")
     both = Uncertain(np.asarray(model.vector()), model.with_vector, {**first.sources, **second.sources})
     stages = sensitivity(both, mission(), ["rate"]).results[0].budget.stages
     assert stages == {"rate table": pytest.approx(0.25), "chamber": pytest.approx(0.75)}
 
 
+@pytest.mark.long
 def test_three_gyros_turn_a_platform():
     """Tilts b sin(ωt)/ω with Schuler's ω, and b t in azimuth, to what the Earth turns in ten minutes: 4 %."""
     covariance = np.diag([0.04, 1e-12]) * DEG_H**2
@@ -186,7 +189,7 @@ def test_the_symmetric_factor_is_a_root_that_treats_all_alike():
 
 def test_what_a_test_tells_is_that_of_the_dense_covariance():
     """V = σ²I + c cᵀ + diag, inverted as a whole."""
-    model = thermal(COVARIANCE, {"noise_white": WHITE}).model
+    model = thermal(COVARIANCE, WHITE_ALONE).model
     instruments = {"temperature": Instrument(0.5, 0.2), "rate": Instrument(1e-6)}
     told = information(model, mission(temperature=RAMP), instruments)
     j = np.column_stack([np.ones(ROWS), RAMP - 20.0])
@@ -200,7 +203,7 @@ def test_what_a_test_tells_is_that_of_the_dense_covariance():
 def test_the_next_test_halves_the_variance_of_the_last():
     """After a campaign of white noise alone, the same again."""
     j, campaign = np.column_stack([np.ones(ROWS), RAMP - 20.0]), mission(temperature=RAMP)
-    estimate = thermal(WHITE**2 / STEP * np.linalg.inv(j.T @ j), {"noise_white": WHITE})
+    estimate = thermal(WHITE**2 / STEP * np.linalg.inv(j.T @ j), WHITE_ALONE)
     found = sensitivity(estimate, campaign, ["angle"], instruments={"temperature": Instrument(1.0)})
     free = sensitivity(estimate, campaign, ["angle"])
     now = free.results[0].budget.std

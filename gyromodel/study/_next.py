@@ -100,8 +100,10 @@ def covariance_after(
         errors: A.
         told: information M of the new data.
     """
-    inner = np.eye(errors.shape[1]) + errors.T @ told @ errors
-    return errors @ np.linalg.solve(inner, errors.T)
+    # By eigenvalues: beside what new data tell of a vague prior, the 1 may be lost in rounding.
+    values, vectors = np.linalg.eigh(errors.T @ told @ errors)
+    turned = errors @ vectors
+    return (turned / (1.0 + np.maximum(values, 0.0))) @ turned.T
 
 
 def outcome_std(budget: Budget, covariance: Float[np.ndarray, "parameter parameter"]) -> float:
