@@ -96,10 +96,7 @@ def fit_record(
     check_covariates(record, model)
     check_units(model, record.output_unit, record.units)
     model = model.prepared(record.signals)
-    if record.present.sum() <= len(model.slots()) + 1:
-        raise EstimateError(
-            f"{int(record.present.sum())} samples cannot determine {len(model.slots())} parameters and their noise"
-        )
+    check_enough(record, model)
     given = given_ratios(record, model) if ratios is None else ratios
     white = NoiseRatios(jnp.zeros(()), jnp.zeros(()))
     ratios = given if given is not None else white
@@ -119,6 +116,14 @@ def fit_record(
         solution = solve(model, solution.x, record, filter_of(record, white), solver)
         estimate = _finish(record, model, ratios, filter, solution, variance=estimate.white_variance)
     return estimate
+
+
+def check_enough(record: Record, model: GyroModel) -> None:
+    """Refuse a record without samples to spare."""
+    if record.present.sum() <= len(model.slots()) + 1:
+        raise EstimateError(
+            f"{int(record.present.sum())} samples cannot determine {len(model.slots())} parameters and their noise"
+        )
 
 
 def check_covariates(record: Record, model: GyroModel) -> None:
@@ -196,19 +201,7 @@ def _finish(
     variance: float | None = None,
 ) -> Estimate:
     """The estimate at a solution; `variance` is the white one where the solution is that of ordinary least squares."""
-    if not solution.converged:
-        raise EstimateError(
-            f"the fit of {', '.join(model.labels)} did not converge in {solution.iterations} iterations: "
-            "give start values near the solution, or fix some parameters"
-        )
-    model = model.with_vector(jnp.asarray(solution.x))
-    for effect in model.effects:
-        try:
-            replace(effect)
-        except ValueError as problem:
-            raise EstimateError(
-                f"the fit left what {effect.label} can be ({problem}): give start values nearer the solution"
-            ) from None
+    model = checked_solution(model, solution.x, solution.converged, solution.iterations)
     ordinary = variance is not None
     predicted, jacobian = model.linearise(record.signals)
     output, present = record.signals["output"], record.sampling.present
@@ -241,6 +234,24 @@ def _finish(
         noise_given=bool(model.noise),
         ordinary=ordinary,
     )
+
+
+def checked_solution(model: GyroModel, x: np.ndarray, converged: bool, iterations: int) -> GyroModel:
+    """The model at a solution; refuses one that did not converge, or left what an effect can be."""
+    if not converged:
+        raise EstimateError(
+            f"the fit of {', '.join(model.labels)} did not converge in {iterations} iterations: "
+            "give start values near the solution, or fix some parameters"
+        )
+    model = model.with_vector(jnp.asarray(x))
+    for effect in model.effects:
+        try:
+            replace(effect)
+        except ValueError as problem:
+            raise EstimateError(
+                f"the fit left what {effect.label} can be ({problem}): give start values nearer the solution"
+            ) from None
+    return model
 
 
 def unit_covariance(whitened_jacobian: np.ndarray, model: GyroModel) -> np.ndarray:

@@ -1,0 +1,145 @@
+"""The normal equations of one campaign inside a compiled program, gathered block by block.
+
+Rows are parameters and run along the samples, so that they are whole vectors for the processor; a block of them stays in
+cache, the Jacobian as a whole is never stored, and what is padded behind the last sample costs nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from gyromodel.effects import Effect, Signals
+from gyromodel.model import GyroModel
+from gyromodel.numerics.state_space import Filter, at_rest, whiten_on
+
+BLOCK = 512
+
+# Of one effect: a row for each linear coefficient, and one for each nonlinear parameter; None where there is none free.
+Rows = tuple[Float[Array, "*block coefficient sample"], Float[Array, "*block shape sample"] | None]
+
+
+class Blocks(NamedTuple):
+    """A campaign's samples in blocks.
+
+    `weight` is one over the white noise relative to its unit, zero where there is no sample; `used` counts the blocks
+    that hold samples; with `filter` the noise is coloured.
+    """
+
+    signals: Mapping[str, Float[Array, "block sample"]]
+    weight: Float[Array, "block sample"]
+    used: Int[Array, ""]
+    filter: Filter | None
+
+    def whole(self) -> dict[str, Float[Array, " sample"]]:
+        """The signals in one piece."""
+        return {name: values.ravel() for name, values in self.signals.items()}
+
+
+def gram_of(model: GyroModel, data: Blocks) -> Callable[[Float[Array, " parameter"]], Float[Array, "column column"]]:
+    """[J, r]ᵀ[J, r] of the whitened residual r as a function of the free parameters.
+
+    Rows that no nonlinear parameter shapes are computed once.
+    """
+    free = _free(model)
+    steady = {
+        i: in_blocks(effect.columns(data.whole()).T)
+        for i, effect in enumerate(model.effects)
+        if effect.site != "gain" and not _shaped(effect, free.get(i, ()))
+    }
+
+    def gram(x: Float[Array, " parameter"]) -> Float[Array, "column column"]:
+        now = model.with_vector(x)
+        # An effect that looks at neighbouring samples must see all of them.
+        known: dict[int, Rows] = {i: (rows, None) for i, rows in steady.items()}
+        for i, effect in enumerate(now.effects):
+            if effect.remembers and i not in known:
+                rows = _rows(effect, data.whole(), free[i])
+                known[i] = tuple(None if r is None else in_blocks(r) for r in rows)  # type: ignore[assignment]
+
+        def add(block, carry):
+            state, total = carry
+            part = jax.tree.map(lambda values: values[block], (data.signals, data.weight, known, data.filter))
+            signals, weight, rows, filter = part
+            stacked = _stacked(now, signals, rows, free)
+            if filter is None:
+                stacked = jnp.where(weight > 0, stacked * weight, 0.0)
+            else:
+                state, white = whiten_on(state, filter, stacked.T)
+                stacked = white.T
+            return state, total + stacked @ stacked.T
+
+        width = x.shape[0] + 1
+        state = jnp.zeros(0)
+        if data.filter is not None:
+            state = at_rest(jax.tree.map(lambda values: values[0], data.filter), width)
+        return jax.lax.fori_loop(0, data.used, add, (state, jnp.zeros((width, width))))[1]
+
+    return gram
+
+
+def in_blocks(rows: Float[Array, "row sample"]) -> Float[Array, "block row sample"]:
+    """Rows cut into blocks."""
+    return rows.reshape(len(rows), -1, BLOCK).swapaxes(0, 1)
+
+
+def _free(model: GyroModel) -> dict[int, tuple[str, ...]]:
+    """Free fields by the place of their effect."""
+    fields: dict[int, tuple[str, ...]] = {}
+    for slot in model.slots():
+        names = fields.get(slot.effect, ())
+        fields[slot.effect] = names if slot.field in names else (*names, slot.field)
+    return fields
+
+
+def _shaped(effect: Effect, free: tuple[str, ...]) -> bool:
+    return any(not effect.declared()[name].linear for name in free)
+
+
+def _rows(effect: Effect, signals: Signals, free: tuple[str, ...]) -> Rows:
+    """What is fixed of the shapes is left out before rows are made of them: its derivatives are not computed then."""
+    if not _shaped(effect, free):
+        return effect.columns(signals).T, None
+    places, start = [], 0
+    for name in (k for k, declared in effect.declared().items() if not declared.linear):
+        size = np.size(getattr(effect, name))
+        places += range(start, start + size) if name in free else ()
+        start += size
+    derivatives = effect.shape_derivatives(signals)
+    return effect.columns(signals).T, jnp.stack([derivatives[:, k] for k in places])
+
+
+def _stacked(
+    model: GyroModel, signals: Signals, known: Mapping[int, Rows], free: Mapping[int, tuple[str, ...]]
+) -> Float[Array, "row sample"]:
+    """The derivative of the output by each free parameter, and last predicted minus measured output."""
+    rate = signals.get("rate", jnp.zeros_like(signals["time"]))
+    scale = jnp.ones_like(rate)
+    rows: dict[int, Rows] = {}
+    for i, effect in enumerate(model.effects):
+        if effect.site == "gain":
+            continue
+        rows[i] = known[i] if i in known else _rows(effect, signals, free[i])
+        term = effect.linear() @ rows[i][0]
+        rate, scale = (rate + term, scale) if effect.site == "rate" else (rate, scale + term)
+    gain = model.gain()
+    prediction = gain * rate * scale
+    stacked = []
+    for i, names in free.items():
+        effect = model.effects[i]
+        if effect.site == "gain":
+            stacked.append((prediction / effect.value)[None])  # type: ignore[attr-defined]
+            continue
+        by = gain * scale if effect.site == "rate" else gain * rate
+        for name in names:
+            linear = effect.declared()[name].linear
+            alike = [k for k, d in effect.declared().items() if d.linear == linear and (linear or k in names)]
+            start = sum(np.size(getattr(effect, k)) for k in alike[: alike.index(name)])
+            part = rows[i][0 if linear else 1]
+            stacked.append(by * part[start : start + np.size(getattr(effect, name))])  # type: ignore[index]
+    return jnp.concatenate([*stacked, (prediction - signals["output"])[None]])

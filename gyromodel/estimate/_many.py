@@ -1,0 +1,389 @@
+"""One model fitted to each of many campaigns by one compiled program, several threads calling it."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import threading
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from gyromodel.effects import Effect, Signals
+from gyromodel.estimate._blocks import BLOCK, Blocks, gram_of
+from gyromodel.estimate._estimate import EstimateError
+from gyromodel.estimate._fit import check_covariates, check_enough, checked_solution, given_ratios, unit_covariance
+from gyromodel.model import GyroModel, check_units, record_span
+from gyromodel.noise import NoiseRatios, markov_sum
+from gyromodel.numerics.compiled_least_squares import Search, search_minimum
+from gyromodel.numerics.state_space import Sampling, build_filter
+from gyromodel.signals import Record
+from gyromodel.units import factor, internal_unit
+
+# Campaigns handed to the compiled program in one call.
+TOGETHER = 16
+MOST_ITERATIONS = 100
+# Distance from the minimum, in standard deviations of the parameters, at which a search ends with one more step.
+PRECISION = 1e-4
+# Standard deviations by which chi-squared may lie above its degrees of freedom before other starts are tried.
+BAD_FIT = 5.0
+# Starts looked at where a fit is bad, and how many of the best are followed to their minimum.
+STARTS, FOLLOWED = 64, 4
+# Starts of a nonlinear parameter without a grid of its own: the given one and so many of its typical sizes around it.
+AROUND = (0.0, -4.0, -1.0, -0.25, 0.25, 1.0, 4.0)
+
+
+@dataclass(frozen=True)
+class ManyFits:
+    """Fits of one model structure to many campaigns, in their order; a fit that failed is NaN and has its reason.
+
+    Attributes:
+        prepared: each campaign's model before the fit, with what depends on the campaign filled in; `model` has the fit.
+        values: of the free parameters in the order of `slots()`, internal units.
+        covariance: of these.
+        white_variance: variance of the white noise of one sample, output unit squared.
+        reduced_chi_squared: `white_variance` over the stated one; where none is stated over half the mean square of the
+            residual's successive differences, which a wrong minimum leaves small.
+        iterations: points that the last search of a campaign looked at.
+        converged: whether there is an estimate.
+        restarted: whether other starts of the nonlinear parameters were tried.
+        reasons: why a fit failed, one sentence; empty where it did not.
+    """
+
+    prepared: Sequence[GyroModel] = field(repr=False)
+    values: Float[np.ndarray, "campaign parameter"]
+    covariance: Float[np.ndarray, "campaign parameter parameter"] = field(repr=False)
+    white_variance: Float[np.ndarray, " campaign"]
+    reduced_chi_squared: Float[np.ndarray, " campaign"]
+    iterations: Int[np.ndarray, " campaign"]
+    converged: Bool[np.ndarray, " campaign"]
+    restarted: Bool[np.ndarray, " campaign"]
+    reasons: Sequence[str]
+
+    @property
+    def std(self) -> Float[np.ndarray, "campaign parameter"]:
+        """Standard uncertainties, internal units."""
+        return np.sqrt(np.einsum("cpp->cp", self.covariance))
+
+    def model(self, campaign: int) -> GyroModel:
+        """A campaign's model at its estimate, its noise as it was given."""
+        return self.prepared[campaign].with_vector(self.values[campaign])
+
+
+class _Campaign(NamedTuple):
+    """One that waits to be fitted: where it stands, its data, and its prepared model."""
+
+    place: int
+    record: Record
+    model: GyroModel
+    ratios: NoiseRatios | None
+
+
+class _Fitted(NamedTuple):
+    x: np.ndarray
+    covariance: np.ndarray
+    white: float
+    chi: float
+    iterations: int
+    restarted: bool
+    reason: str
+
+
+def fit_many(
+    records: Iterable[Record],
+    model: GyroModel,
+    *,
+    restarts: bool = True,
+    threads: int | None = None,
+) -> ManyFits:
+    """Fit the free parameters of a model to each of many campaigns.
+
+    Values are those of `fit_record` with the noise that the model states or, where it states none, with white noise of
+    unknown size; noise is not identified here. One program is compiled for a model's structure and each power of two of
+    the campaigns' lengths. Only the campaigns being fitted are held in memory, so that `records` may be a generator.
+
+    Args:
+        records: the campaigns' data.
+        model: what to fit; where it states its reference points, parameters of different campaigns compare.
+        restarts: try other starts of the nonlinear parameters where a fit is bad or found no minimum.
+        threads: how many call the compiled program at once; by default one for each processor.
+
+    Raises:
+        EstimateError: JAX runs in single precision. A campaign that cannot be fitted is told of in the result.
+    """
+    if not jnp.zeros(()).dtype == jnp.float64:
+        raise EstimateError("JAX runs in single precision; import gyromodel before using jax, or set JAX_ENABLE_X64=1")
+    threads = threads or _processors()
+    prepared: list[GyroModel] = []
+    done: dict[int, _Fitted] = {}
+    waiting: dict[Any, list[_Campaign]] = {}
+    compiled: dict[Any, threading.Event] = {}
+    running: deque[Future[dict[int, _Fitted]]] = deque()
+
+    def work(key: Any, campaigns: list[_Campaign], first: bool) -> dict[int, _Fitted]:
+        # The first of a kind compiles; the others wait for its program instead of compiling it too.
+        if not first:
+            compiled[key].wait()
+        try:
+            return _fit_together(campaigns, key[0], restarts)
+        finally:
+            compiled[key].set()
+
+    with ThreadPoolExecutor(threads) as pool:
+
+        def start(key: Any) -> None:
+            first = key not in compiled
+            compiled.setdefault(key, threading.Event())
+            running.append(pool.submit(work, key, waiting.pop(key), first))
+            while len(running) > 2 * threads:
+                done.update(running.popleft().result())
+
+        for place, record in enumerate(records):
+            prepared.append(model)
+            try:
+                campaign = _ready(place, record, model)
+            except ValueError as problem:
+                done[place] = _failed(str(problem))
+                continue
+            prepared[place] = campaign.model
+            key = _key(campaign)
+            waiting.setdefault(key, []).append(campaign)
+            if len(waiting[key]) == TOGETHER:
+                start(key)
+        for key in list(waiting):
+            start(key)
+        for future in running:
+            done.update(future.result())
+    return _gathered(prepared, [done[i] for i in range(len(prepared))])
+
+
+def _processors() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _ready(place: int, record: Record, model: GyroModel) -> _Campaign:
+    """The campaign with its prepared model; ModelError or EstimateError where it cannot be fitted."""
+    check_units(model, record.output_unit, record.units)
+    model = model.prepared(record.signals)
+    check_enough(record, model)
+    ratios = given_ratios(record, model)
+    coloured = ratios is not None and any(float(r) > 0 for r in ratios[:3])
+    return _Campaign(place, record, model, ratios if coloured else None)
+
+
+def _key(campaign: _Campaign) -> tuple:
+    """What must be alike for one program: blocks (a power of two), model structure, signals, colour of the noise."""
+    blocks = 2 ** max(int(np.ceil(np.log2(campaign.record.rows / BLOCK))), 0)
+    leaves, structure = jax.tree.flatten(campaign.model)
+    shapes = tuple(np.shape(leaf) for leaf in leaves)
+    return blocks, structure, shapes, tuple(sorted(campaign.record.signals)), campaign.ratios is None
+
+
+class _Noise(NamedTuple):
+    """Coloured noise of a campaign: ratios, sample interval and longest time constant (s), and the sampling."""
+
+    ratios: NoiseRatios
+    interval: Float[Array, ""]
+    longest: Float[Array, ""]
+    sampling: Sampling
+
+
+class _Data(NamedTuple):
+    """Campaigns side by side, the first axis of every array."""
+
+    models: GyroModel
+    blocks: Blocks
+    noise: _Noise | None
+    freedom: Float[np.ndarray, " campaign"]
+
+
+def _side_by_side(campaigns: Sequence[_Campaign], blocks: int) -> _Data:
+    """Arrays of a fixed size, whatever the number of campaigns: the first stands in for those that lack."""
+    records = [c.record for c in campaigns]
+    lack = TOGETHER - len(campaigns)
+
+    def stacked(each: Sequence[Any]) -> Any:
+        return jax.tree.map(lambda *values: np.stack([np.asarray(v) for v in values]), *each, *each[:1] * lack)
+
+    def padded(values: Any, rows: int, **how: Any) -> np.ndarray:
+        values = np.asarray(values)[:rows]
+        return np.pad(values, (0, blocks * BLOCK - rows), **how).reshape(blocks, BLOCK)
+
+    signals = stacked([{k: padded(v, r.rows, mode="edge") for k, v in r.signals.items()} for r in records])
+    weight = stacked([padded(r.present / np.sqrt(np.asarray(r.sampling.white)[: r.rows]), r.rows) for r in records])
+    used = stacked([np.asarray(-(-r.rows // BLOCK)) for r in records])
+    freedom = [float(c.record.present.sum() - len(c.model.slots())) for c in campaigns]
+    noise = None
+    if campaigns[0].ratios is not None:
+        noise = stacked(
+            [
+                _Noise(
+                    c.ratios,
+                    c.record.interval,
+                    c.ratios.longest(record_span(c.record)),
+                    Sampling(*(padded(v, c.record.rows).ravel() for v in c.record.sampling[:3]), np.ones(blocks * BLOCK)),
+                )
+                for c in campaigns
+            ]
+        )
+    models = stacked([c.model for c in campaigns])
+    return _Data(models, Blocks(signals, weight, used, None), noise, np.resize(freedom, TOGETHER))
+
+
+@jax.jit
+def _search(data: _Data, campaign, start, most) -> tuple[Search, Float[Array, " task"]]:
+    """One search after the other, each of a campaign from a start; and the residuals' roughness where they end."""
+    linear = np.array([slot.linear for slot in data.models.slots()])
+
+    def one(task):
+        campaign, start, most = task
+        model, blocks, noise, freedom = jax.tree.map(lambda values: values[campaign], data)
+        if noise is not None:
+            filter = build_filter(markov_sum(noise.ratios, noise.interval, noise.longest), noise.sampling)
+            blocks = blocks._replace(filter=jax.tree.map(lambda v: v.reshape(-1, BLOCK, *v.shape[1:]), filter))
+        found = search_minimum(gram_of(model, blocks), start, linear, PRECISION**2 / freedom, most)
+        return found, _roughness(model.with_vector(found.x), blocks)
+
+    return jax.lax.map(one, (campaign, start, most))
+
+
+def _roughness(model: GyroModel, data: Blocks) -> Float[Array, ""]:
+    """Half the mean square of successive differences of the weighted residual: the variance of its white part."""
+    signals, weight = data.whole(), data.weight.ravel()
+    residual = jnp.where(weight > 0, weight * (signals["output"] - model.predict(signals)), 0.0)
+    pairs = (weight[1:] > 0) & (weight[:-1] > 0)
+    return jnp.sum(jnp.where(pairs, jnp.diff(residual), 0.0) ** 2) / 2.0 / jnp.maximum(pairs.sum(), 1)
+
+
+def _searches(data: _Data, tasks: Sequence[tuple[int, np.ndarray]], most: int) -> list[tuple[Search, float]]:
+    """Searches of campaigns from starts, so many in a call that its arrays have a fixed size."""
+    found = []
+    for first in range(0, len(tasks), TOGETHER):
+        some = tasks[first : first + TOGETHER]
+        lack = TOGETHER - len(some)
+        campaign = np.array([i for i, _ in some] + [0] * lack)
+        start = np.stack([x for _, x in some] + [some[0][1]] * lack)
+        results = jax.tree.map(np.asarray, _search(data, campaign, start, np.array([most] * len(some) + [0] * lack)))
+        found += [jax.tree.map(lambda values, k=k: values[k], results) for k in range(len(some))]
+    return found
+
+
+def _fit_together(campaigns: list[_Campaign], blocks: int, restarts: bool) -> dict[int, _Fitted]:
+    data = _side_by_side(campaigns, blocks)
+    starts = [np.asarray(c.model.vector()) for c in campaigns]
+    first = _searches(data, list(enumerate(starts)), MOST_ITERATIONS)
+    fitted = [_finish(c, *found) for c, found in zip(campaigns, first, strict=True)]
+    bad = [i for i, fit in enumerate(fitted) if restarts and _worth_another_start(fit, first[i][0], data.freedom[i])]
+    tried = [(i, x) for i in bad for x in _starts(campaigns[i].model, campaigns[i].record.signals)]
+    looked = [found.cost - found.promise for found, _ in _searches(data, tried, 1)]
+    followed = []
+    for i in {i for i, _ in tried}:
+        own = [(cost, k) for k, cost in enumerate(looked) if tried[k][0] == i and np.isfinite(cost)]
+        followed += [tried[k] for _, k in sorted(own)[:FOLLOWED]]
+    for (i, _), found in zip(followed, _searches(data, followed, MOST_ITERATIONS), strict=True):
+        other = _finish(campaigns[i], *found)
+        better = not other.reason and (fitted[i].reason or other.white < fitted[i].white)
+        fitted[i] = (other if better else fitted[i])._replace(restarted=True)
+    return {c.place: fit for c, fit in zip(campaigns, fitted, strict=True)}
+
+
+def _worth_another_start(fit: _Fitted, found: Search, freedom: float) -> bool:
+    """Whether a fit found no minimum though it could look for one, or one that leaves more than the noise."""
+    if fit.reason:
+        return bool(np.isfinite(found.cost)) and not found.converged
+    return fit.chi > 1.0 + BAD_FIT * np.sqrt(2.0 / freedom)
+
+
+def _failed(reason: str) -> _Fitted:
+    return _Fitted(np.zeros(0), np.zeros((0, 0)), np.nan, np.nan, 0, False, reason)
+
+
+def _finish(campaign: _Campaign, found: Search, roughness: float) -> _Fitted:
+    """The estimate where a search ended, or why there is none."""
+    record, p = campaign.record, len(found.x)
+    try:
+        if not np.isfinite(found.cost):
+            check_covariates(record, campaign.model)
+            raise EstimateError("the model is not finite at its start values: give others")
+        model = checked_solution(campaign.model, found.x, bool(found.converged), int(found.iterations))
+        # Any root of JᵀJ has J's singular values; those lost in its rounding are zero.
+        norm = np.sqrt(np.diag(found.information))
+        values, vectors = np.linalg.eigh(found.information / np.outer(norm, norm) if (norm > 0).all() else np.diag(norm))
+        values = np.where(values > p * np.finfo(float).eps * values.max(initial=0.0), values, 0.0)
+        covariance = unit_covariance(np.sqrt(values)[:, None] * vectors.T * norm, model)
+    except ValueError as problem:
+        return _failed(str(problem))._replace(iterations=int(found.iterations))
+    freedom = float(record.present.sum() - p)
+    white = float(found.cost - found.promise) / freedom
+    expected = roughness
+    if model.noise:
+        expected = float(model.noise["noise_white"]) ** 2 / record.interval * float(model.gain()) ** 2
+    return _Fitted(found.x, covariance * white, white, white / expected, int(found.iterations), False, "")
+
+
+def _starts(model: GyroModel, signals: Signals) -> list[np.ndarray]:
+    """Starts at other values of the free nonlinear parameters: all combinations of their levels, or a draw of them."""
+    start, slots = np.asarray(model.vector()), model.slots()
+    levels: list[list[tuple[list[int], np.ndarray]]] = []
+    for i, effect in enumerate(model.effects):
+        own = [k for k, slot in enumerate(slots) if slot.effect == i and not slot.linear]
+        if not own:
+            continue
+        forms = [np.array([np.ravel(getattr(e, slots[k].field))[slots[k].index] for k in own]) for e in _alike(effect, signals)]
+        if forms:
+            levels.append([(own, values) for values in forms])
+            continue
+        for k in own:
+            declared = effect.declared()[slots[k].field]
+            size = declared.typical * factor(declared.unit, internal_unit(declared.unit))
+            levels.append([([k], start[[k]] + size * times) for times in AROUND])
+    if not levels:
+        return []
+    if np.prod([float(len(each)) for each in levels]) <= STARTS:
+        chosen: Iterable[Sequence[tuple[list[int], np.ndarray]]] = itertools.product(*levels)
+    else:
+        rng = np.random.default_rng(0)
+        chosen = [[each[rng.integers(len(each))] for each in levels] for _ in range(STARTS)]
+    found = []
+    for combination in chosen:
+        x = start.copy()
+        for places, values in combination:
+            x[places] = values
+        found.append(x)
+    return found
+
+
+def _alike(effect: Effect, signals: Signals) -> list[Effect]:
+    """The forms that a search would try, of the same shapes."""
+    shapes = {name: np.shape(getattr(effect, name)) for name in effect.declared()}
+    forms = effect.candidates(signals)
+    return [e for e in forms if all(np.shape(getattr(e, name)) == shape for name, shape in shapes.items())]
+
+
+def _gathered(prepared: list[GyroModel], fits: list[_Fitted]) -> ManyFits:
+    """Results as arrays; campaigns without an estimate, or of another number of parameters, are NaN."""
+    p = next((len(fit.x) for fit in fits if not fit.reason), 0)
+    odd = f"the model has another number of free parameters here than the {p} of the first campaign"
+    fits = [fit if fit.reason or len(fit.x) == p else _failed(odd) for fit in fits]
+    good = np.array([not fit.reason for fit in fits], bool)
+    values, covariance = np.full((len(fits), p), np.nan), np.full((len(fits), p, p), np.nan)
+    for i in np.flatnonzero(good):
+        values[i], covariance[i] = fits[i].x, fits[i].covariance
+    return ManyFits(
+        prepared=prepared,
+        values=values,
+        covariance=covariance,
+        white_variance=np.array([fit.white for fit in fits]),
+        reduced_chi_squared=np.array([fit.chi for fit in fits]),
+        iterations=np.array([fit.iterations for fit in fits], int),
+        converged=good,
+        restarted=np.array([fit.restarted for fit in fits], bool),
+        reasons=[fit.reason for fit in fits],
+    )

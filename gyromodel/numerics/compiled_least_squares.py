@@ -1,0 +1,151 @@
+"""Scaled Levenberg-Marquardt inside a compiled program, one fit at a time: what `lax.map` runs over an archive.
+
+The same search as that of `least_squares`, on normal equations alone, with no call of LAPACK: such calls, made by
+several threads from compiled loops, could wait for one another for ever.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from gyromodel.numerics.least_squares import FIRST_DAMPING, KINK_TOLERANCE, LEAST_DAMPING
+
+# What is left of a column of unit length beside those before it, squared: with less it is held in a step.
+LEAST_PIVOT = 1e-14
+# Relative decreases of the cost below this are lost in its rounding.
+ROUNDING = 1e-13
+
+
+class Search(NamedTuple):
+    """Where a search ended: the point, the cost there, JᵀJ, and the decrease that its next step promises."""
+
+    x: Float[Array, " parameter"]
+    cost: Float[Array, ""]
+    information: Float[Array, "parameter parameter"]
+    promise: Float[Array, ""]
+    iterations: Int[Array, ""]
+    converged: Bool[Array, ""]
+
+
+class _State(NamedTuple):
+    x: Float[Array, " parameter"]
+    gram: Float[Array, "column column"]
+    scale: Float[Array, " parameter"]
+    step: Float[Array, " parameter"]
+    promise: Float[Array, ""]
+    damping: Float[Array, ""]
+    growth: Float[Array, ""]
+    iteration: Int[Array, ""]
+    ended: Bool[Array, ""]
+    converged: Bool[Array, ""]
+
+
+def search_minimum(
+    gram: Callable[[Float[Array, " parameter"]], Float[Array, "column column"]],
+    start: Float[Array, " parameter"],
+    linear: Bool[Array, " parameter"],
+    tolerance: Float[Array, ""] | float,
+    most: Int[Array, ""] | int,
+) -> Search:
+    """Minimise |r(x)|², with one exact solve for the linear parameters at the start.
+
+    Args:
+        gram: [J, r]ᵀ[J, r] at a point, J the derivative of r.
+        start: where to begin.
+        linear: which parameters r is linear in.
+        tolerance: decrease of the cost, as a part of it, that still counts.
+        most: points looked at, rejected ones and the start included; with one, `promise` is what the linear solve would
+            gain; with none, nothing is computed.
+
+    Returns:
+        The last step of a search that converged is taken without looking at where it leads.
+    """
+    p = start.shape[0]
+    tolerance = jnp.maximum(tolerance, ROUNDING)
+
+    def look(state: _State) -> _State:
+        new = gram(state.x + state.step)
+        before, cost = state.gram[p, p], new[p, p]
+        first = state.iteration == 0
+        # Comparisons with NaN are false: such a trial is rejected.
+        better = jnp.isfinite(new).all() & (cost <= before)
+        decrease = before - cost
+        # Decrease over what the linear model promised: near one, the damping falls (Nielsen 1999, equation 2.4).
+        ratio = decrease / (state.promise + state.damping * jnp.sum((state.scale * state.step) ** 2))
+        eased = jnp.maximum(state.damping * jnp.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3), LEAST_DAMPING)
+        eased = jnp.where(ratio < 0.25, jnp.maximum(eased, FIRST_DAMPING), eased)
+        eased = jnp.where(first, state.damping, eased)
+        damping = jnp.where(better, eased, jnp.maximum(state.growth * state.damping, FIRST_DAMPING))
+        growth = jnp.where(better, 2.0, 2.0 * state.growth)
+        x = jnp.where(better, state.x + state.step, state.x)
+        now = jnp.where(better, new, state.gram)
+        a, g, cost_now = now[:p, :p], now[:p, p], now[p, p]
+        scale = jnp.maximum(state.scale, jnp.sqrt(jnp.maximum(jnp.diag(a), 1e-300)))
+        step = -solve_positive(a + jnp.diag(damping * scale**2), g, first & ~linear)
+        promise = -g @ step
+        least = tolerance * cost_now
+        # Under heavy damping a small promise says nothing: then the residual must be orthogonal to every column, or the
+        # last step, so short that it cost next to nothing, still led up, as where the cost has a kink.
+        orthogonal = jnp.all(jnp.abs(g) <= 1e-6 * scale * jnp.sqrt(cost_now))
+        kink = ~better & (-decrease <= KINK_TOLERANCE * least)
+        small = (promise <= least) & (~first | linear.all())
+        settled = better & (decrease <= least) & (state.iteration > 1)
+        hopeless = first & ~better
+        return _State(
+            x,
+            now,
+            scale,
+            jnp.where(hopeless, 0.0, step),
+            promise,
+            damping,
+            growth,
+            state.iteration + 1,
+            small | settled | hopeless,
+            (small & ((damping < 1.0) | orthogonal | kink)) | settled,
+        )
+
+    nothing = jnp.full((p + 1, p + 1), jnp.inf)
+    begin = _State(
+        start,
+        nothing,
+        jnp.zeros(p),
+        jnp.zeros(p),
+        jnp.zeros(()),
+        jnp.asarray(LEAST_DAMPING),
+        jnp.asarray(2.0),
+        jnp.asarray(0),
+        jnp.asarray(False),
+        jnp.asarray(False),
+    )
+    end = jax.lax.while_loop(lambda s: ~s.ended & (s.iteration < most), look, begin)
+    polished = end.converged & jnp.isfinite(end.step).all()
+    x = jnp.where(polished, end.x + end.step, end.x)
+    return Search(x, end.gram[p, p], end.gram[:p, :p], end.promise, end.iteration, end.converged)
+
+
+def solve_positive(
+    matrix: Float[Array, "unknown unknown"], right: Float[Array, " unknown"], held: Bool[Array, " unknown"]
+) -> Float[Array, " unknown"]:
+    """Solve a symmetric positive definite system, some unknowns held at zero.
+
+    The matrix is scaled to a unit diagonal and eliminated without exchanges, the Cholesky factor's pivots; an unknown
+    whose pivot vanishes beside those before it is held as well.
+    """
+    p = right.shape[0]
+    size = jnp.sqrt(jnp.maximum(jnp.diag(matrix), 0.0))
+    size = jnp.where(size > 0, size, 1.0)
+    system = jnp.concatenate([matrix / (size[:, None] * size), (right / size)[:, None]], axis=1)
+
+    def eliminate(j, m):
+        row = m[j]
+        pivot = row[j]
+        free = ~held[j] & (pivot > LEAST_PIVOT)
+        row = jnp.where(free, row / jnp.where(free, pivot, 1.0), 0.0)
+        return (m - m[:, j][:, None] * row).at[j].set(row)
+
+    return jax.lax.fori_loop(0, p, eliminate, system)[:, p] / size
