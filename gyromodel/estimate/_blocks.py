@@ -41,26 +41,40 @@ class Blocks(NamedTuple):
         return {name: values.ravel() for name, values in self.signals.items()}
 
 
-def gram_of(model: GyroModel, data: Blocks) -> Callable[[Float[Array, " parameter"]], Float[Array, "column column"]]:
-    """[J, r]ᵀ[J, r] of the whitened residual r as a function of the free parameters.
+Known = Mapping[int, Rows]
+Vector = Float[Array, " parameter"]
 
-    Rows that no nonlinear parameter shapes are computed once.
+
+def gram_and_roughness(
+    model: GyroModel, data: Blocks
+) -> tuple[Callable[[Vector], Float[Array, "column column"]], Callable[[Vector], Float[Array, ""]]]:
+    """Two functions of the free parameters; rows that no nonlinear parameter shapes are computed once for both.
+
+    Returns:
+        [J, r]ᵀ[J, r] of the whitened residual r; and half the mean square of the successive differences of the weighted
+        residual, which is the variance of its white part.
     """
     free = _free(model)
-    steady = {
-        i: in_blocks(effect.columns(data.whole()).T)
-        for i, effect in enumerate(model.effects)
-        if effect.site != "gain" and not _shaped(effect, free.get(i, ()))
-    }
+    steady: dict[int, Rows] = {}
+    for i, effect in enumerate(model.effects):
+        if effect.site != "gain" and not _shaped(effect, free.get(i, ())):
+            if effect.remembers:
+                steady[i] = _in_blocks(effect.columns(data.whole()).T), None
+            else:
+                steady[i] = jax.lax.map(lambda part, effect=effect: effect.columns(part).T, data.signals), None
 
-    def gram(x: Float[Array, " parameter"]) -> Float[Array, "column column"]:
+    def at(x: Vector) -> tuple[GyroModel, Known]:
+        """The model, and rows of effects that look at neighbouring samples: they must see all of them."""
         now = model.with_vector(x)
-        # An effect that looks at neighbouring samples must see all of them.
-        known: dict[int, Rows] = {i: (rows, None) for i, rows in steady.items()}
+        known = dict(steady)
         for i, effect in enumerate(now.effects):
             if effect.remembers and i not in known:
-                rows = _rows(effect, data.whole(), free[i])
-                known[i] = tuple(None if r is None else in_blocks(r) for r in rows)  # type: ignore[assignment]
+                linear, shapes = _rows(effect, data.whole(), free[i])
+                known[i] = _in_blocks(linear), None if shapes is None else _in_blocks(shapes)
+        return now, known
+
+    def gram(x: Vector) -> Float[Array, "column column"]:
+        now, known = at(x)
 
         def add(block, carry):
             state, total = carry
@@ -80,10 +94,22 @@ def gram_of(model: GyroModel, data: Blocks) -> Callable[[Float[Array, " paramete
             state = at_rest(jax.tree.map(lambda values: values[0], data.filter), width)
         return jax.lax.fori_loop(0, data.used, add, (state, jnp.zeros((width, width))))[1]
 
-    return gram
+    def roughness(x: Vector) -> Float[Array, ""]:
+        now, known = at(x)
+
+        def add(block, carry):
+            signals, weight, rows = jax.tree.map(lambda values: values[block], (data.signals, data.weight, known))
+            change = jnp.diff(weight * jnp.where(weight > 0, _stacked(now, signals, rows, free)[-1], 0.0))
+            both = (weight[1:] > 0) & (weight[:-1] > 0)
+            return carry[0] + jnp.sum(jnp.where(both, change, 0.0) ** 2), carry[1] + both.sum()
+
+        squares, pairs = jax.lax.fori_loop(0, data.used, add, (jnp.zeros(()), jnp.zeros((), int)))
+        return squares / 2.0 / jnp.maximum(pairs, 1)
+
+    return gram, roughness
 
 
-def in_blocks(rows: Float[Array, "row sample"]) -> Float[Array, "block row sample"]:
+def _in_blocks(rows: Float[Array, "row sample"]) -> Float[Array, "block row sample"]:
     """Rows cut into blocks."""
     return rows.reshape(len(rows), -1, BLOCK).swapaxes(0, 1)
 

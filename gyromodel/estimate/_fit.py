@@ -96,7 +96,7 @@ def fit_record(
     check_covariates(record, model)
     check_units(model, record.output_unit, record.units)
     model = model.prepared(record.signals)
-    check_enough(record, model)
+    check_enough(record, len(model.slots()))
     given = given_ratios(record, model) if ratios is None else ratios
     white = NoiseRatios(jnp.zeros(()), jnp.zeros(()))
     ratios = given if given is not None else white
@@ -118,12 +118,11 @@ def fit_record(
     return estimate
 
 
-def check_enough(record: Record, model: GyroModel) -> None:
+def check_enough(record: Record, parameters: int) -> None:
     """Refuse a record without samples to spare."""
-    if record.present.sum() <= len(model.slots()) + 1:
-        raise EstimateError(
-            f"{int(record.present.sum())} samples cannot determine {len(model.slots())} parameters and their noise"
-        )
+    samples = int(record.present.sum())
+    if samples <= parameters + 1:
+        raise EstimateError(f"{samples} samples cannot determine {parameters} parameters and their noise")
 
 
 def check_covariates(record: Record, model: GyroModel) -> None:
@@ -259,13 +258,12 @@ def unit_covariance(whitened_jacobian: np.ndarray, model: GyroModel) -> np.ndarr
     p = whitened_jacobian.shape[1]
     if p == 0:
         return np.zeros((0, 0))
-    slots = model.slots()
     norm = np.linalg.norm(whitened_jacobian, axis=0)
     if not np.isfinite(norm).all():
-        lost = sorted({model.labels[slots[i].effect] for i in np.flatnonzero(~np.isfinite(norm))})
+        lost = _named(model, ~np.isfinite(norm))
         raise EstimateError(f"the fit ran away in {', '.join(lost)}: give start values, or fix some parameters")
     if (norm == 0).any():
-        silent = sorted({model.labels[slots[i].effect] for i in np.flatnonzero(norm == 0)})
+        silent = _named(model, norm == 0)
         raise EstimateError(
             f"{', '.join(silent)} cannot be estimated: this campaign does not excite it; remove it or fix it"
         )
@@ -273,13 +271,18 @@ def unit_covariance(whitened_jacobian: np.ndarray, model: GyroModel) -> np.ndarr
     _, singular, directions = np.linalg.svd(r)
     weak = directions[singular < SINGULAR * singular[0]]
     if len(weak):
-        involved = sorted({model.labels[slots[i].effect] for d in weak for i in np.flatnonzero(np.abs(d) > 0.1)})
-        names = " and ".join(involved)
+        names = " and ".join(_named(model, (np.abs(weak) > 0.1).any(axis=0)))
         raise EstimateError(
             f"{names} cannot be told apart on this campaign: fix all but one, or measure where they differ"
         )
     inverse = np.linalg.inv(r)
     return (inverse @ inverse.T) / np.outer(norm, norm)
+
+
+def _named(model: GyroModel, parameters: np.ndarray) -> list[str]:
+    """Labels of the effects that some of the free parameters belong to."""
+    slots = model.slots()
+    return sorted({model.labels[slots[i].effect] for i in np.flatnonzero(parameters)})
 
 
 def _ordinary_covariance(record: Record, filter: Filter, jacobian, model: GyroModel) -> np.ndarray:

@@ -8,7 +8,7 @@ import threading
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from gyromodel.effects import Effect, Signals
-from gyromodel.estimate._blocks import BLOCK, Blocks, gram_of
+from gyromodel.estimate._blocks import BLOCK, Blocks, gram_and_roughness
 from gyromodel.estimate._estimate import EstimateError
-from gyromodel.estimate._fit import check_covariates, check_enough, checked_solution, given_ratios, unit_covariance
-from gyromodel.model import GyroModel, check_units, record_span
+from gyromodel.estimate._fit import SINGULAR, check_covariates, check_enough, checked_solution, given_ratios, unit_covariance
+from gyromodel.model import GyroModel, Slot, check_units, record_span
 from gyromodel.noise import NoiseRatios, markov_sum
 from gyromodel.numerics.compiled_least_squares import Search, search_minimum
 from gyromodel.numerics.state_space import Sampling, build_filter
@@ -31,7 +31,7 @@ from gyromodel.units import factor, internal_unit
 TOGETHER = 16
 MOST_ITERATIONS = 100
 # Distance from the minimum, in standard deviations of the parameters, at which a search ends with one more step.
-PRECISION = 1e-4
+PRECISION = 1e-3
 # Standard deviations by which chi-squared may lie above its degrees of freedom before other starts are tried.
 BAD_FIT = 5.0
 # Starts looked at where a fit is bad, and how many of the best are followed to their minimum.
@@ -83,6 +83,7 @@ class _Campaign(NamedTuple):
     place: int
     record: Record
     model: GyroModel
+    start: np.ndarray
     ratios: NoiseRatios | None
 
 
@@ -122,6 +123,7 @@ def fit_many(
         raise EstimateError("JAX runs in single precision; import gyromodel before using jax, or set JAX_ENABLE_X64=1")
     threads = threads or _processors()
     prepared: list[GyroModel] = []
+    given = np.asarray(model.vector())
     done: dict[int, _Fitted] = {}
     waiting: dict[Any, list[_Campaign]] = {}
     compiled: dict[Any, threading.Event] = {}
@@ -148,7 +150,7 @@ def fit_many(
         for place, record in enumerate(records):
             prepared.append(model)
             try:
-                campaign = _ready(place, record, model)
+                campaign = _ready(place, record, model, given)
             except ValueError as problem:
                 done[place] = _failed(str(problem))
                 continue
@@ -168,14 +170,15 @@ def _processors() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _ready(place: int, record: Record, model: GyroModel) -> _Campaign:
+def _ready(place: int, record: Record, model: GyroModel, given: np.ndarray) -> _Campaign:
     """The campaign with its prepared model; ModelError or EstimateError where it cannot be fitted."""
     check_units(model, record.output_unit, record.units)
-    model = model.prepared(record.signals)
-    check_enough(record, model)
-    ratios = given_ratios(record, model)
+    prepared = model.prepared(record.signals)
+    start = given if prepared is model else np.asarray(prepared.vector())
+    check_enough(record, len(start))
+    ratios = given_ratios(record, prepared)
     coloured = ratios is not None and any(float(r) > 0 for r in ratios[:3])
-    return _Campaign(place, record, model, ratios if coloured else None)
+    return _Campaign(place, record, prepared, start, ratios if coloured else None)
 
 
 def _key(campaign: _Campaign) -> tuple:
@@ -187,10 +190,9 @@ def _key(campaign: _Campaign) -> tuple:
 
 
 class _Noise(NamedTuple):
-    """Coloured noise of a campaign: ratios, sample interval and longest time constant (s), and the sampling."""
+    """Coloured noise of a campaign: ratios, longest time constant (s), and the sampling."""
 
     ratios: NoiseRatios
-    interval: Float[Array, ""]
     longest: Float[Array, ""]
     sampling: Sampling
 
@@ -201,65 +203,74 @@ class _Data(NamedTuple):
     models: GyroModel
     blocks: Blocks
     noise: _Noise | None
+    interval: Float[np.ndarray, " campaign"]
     freedom: Float[np.ndarray, " campaign"]
 
 
 def _side_by_side(campaigns: Sequence[_Campaign], blocks: int) -> _Data:
     """Arrays of a fixed size, whatever the number of campaigns: the first stands in for those that lack."""
+    campaigns = [*campaigns, *campaigns[:1] * (TOGETHER - len(campaigns))]
     records = [c.record for c in campaigns]
-    lack = TOGETHER - len(campaigns)
 
-    def stacked(each: Sequence[Any]) -> Any:
-        return jax.tree.map(lambda *values: np.stack([np.asarray(v) for v in values]), *each, *each[:1] * lack)
+    def padded(each: Iterable[Any]) -> np.ndarray:
+        """Each continued by its last value."""
+        first, *others = (np.asarray(values) for values in each)
+        together = np.empty((TOGETHER, blocks * BLOCK), first.dtype)
+        for row, values, record in zip(together, (first, *others), records, strict=True):
+            row[: record.rows] = values[: record.rows]
+            row[record.rows :] = values[record.rows - 1]
+        return together.reshape(TOGETHER, blocks, BLOCK)
 
-    def padded(values: Any, rows: int, **how: Any) -> np.ndarray:
-        values = np.asarray(values)[:rows]
-        return np.pad(values, (0, blocks * BLOCK - rows), **how).reshape(blocks, BLOCK)
-
-    signals = stacked([{k: padded(v, r.rows, mode="edge") for k, v in r.signals.items()} for r in records])
-    weight = stacked([padded(r.present / np.sqrt(np.asarray(r.sampling.white)[: r.rows]), r.rows) for r in records])
-    used = stacked([np.asarray(-(-r.rows // BLOCK)) for r in records])
-    freedom = [float(c.record.present.sum() - len(c.model.slots())) for c in campaigns]
+    rows = np.arange(blocks * BLOCK).reshape(blocks, BLOCK) < np.array([r.rows for r in records])[:, None, None]
+    signals = {name: padded(r.signals[name] for r in records) for name in records[0].signals}
+    present = padded(r.sampling.present for r in records) & rows
+    weight = present / np.sqrt(padded(r.sampling.white for r in records))
+    used = np.array([-(-r.rows // BLOCK) for r in records])
     noise = None
     if campaigns[0].ratios is not None:
-        noise = stacked(
-            [
-                _Noise(
-                    c.ratios,
-                    c.record.interval,
-                    c.ratios.longest(record_span(c.record)),
-                    Sampling(*(padded(v, c.record.rows).ravel() for v in c.record.sampling[:3]), np.ones(blocks * BLOCK)),
-                )
-                for c in campaigns
-            ]
+        flat = (TOGETHER, blocks * BLOCK)
+        interval, restart = (padded(part).reshape(flat) for part in list(zip(*(r.sampling for r in records)))[:2])
+        white = padded(r.sampling.white for r in records).reshape(flat)
+        noise = _Noise(
+            _stacked([c.ratios for c in campaigns]),
+            np.array([float(c.ratios.longest(record_span(c.record))) for c in campaigns]),
+            Sampling(interval, restart, present.reshape(flat), white),
         )
-    models = stacked([c.model for c in campaigns])
-    return _Data(models, Blocks(signals, weight, used, None), noise, np.resize(freedom, TOGETHER))
+    return _Data(
+        _stacked([c.model for c in campaigns]),
+        Blocks(signals, weight, used, None),
+        noise,
+        np.array([r.interval for r in records]),
+        np.array([float(r.present.sum() - len(c.start)) for r, c in zip(records, campaigns, strict=True)]),
+    )
+
+
+def _stacked(each: Sequence[Any]) -> Any:
+    """Trees of arrays as one whose arrays have a first axis more."""
+    leaves = [[np.asarray(leaf) for leaf in jax.tree.leaves(tree)] for tree in {id(e): e for e in each}.values()]
+    order = list({id(e): None for e in each})
+    numbers = [order.index(id(e)) for e in each]
+    return jax.tree.unflatten(jax.tree.structure(each[0]), [np.stack(leaf)[numbers] for leaf in zip(*leaves, strict=True)])
 
 
 @jax.jit
 def _search(data: _Data, campaign, start, most) -> tuple[Search, Float[Array, " task"]]:
-    """One search after the other, each of a campaign from a start; and the residuals' roughness where they end."""
+    """One search after the other, each of a campaign from a start; and the white variance expected where they end."""
     linear = np.array([slot.linear for slot in data.models.slots()])
 
     def one(task):
         campaign, start, most = task
-        model, blocks, noise, freedom = jax.tree.map(lambda values: values[campaign], data)
+        model, blocks, noise, interval, freedom = jax.tree.map(lambda values: values[campaign], data)
         if noise is not None:
-            filter = build_filter(markov_sum(noise.ratios, noise.interval, noise.longest), noise.sampling)
+            filter = build_filter(markov_sum(noise.ratios, interval, noise.longest), noise.sampling)
             blocks = blocks._replace(filter=jax.tree.map(lambda v: v.reshape(-1, BLOCK, *v.shape[1:]), filter))
-        found = search_minimum(gram_of(model, blocks), start, linear, PRECISION**2 / freedom, most)
-        return found, _roughness(model.with_vector(found.x), blocks)
+        gram, roughness = gram_and_roughness(model, blocks)
+        found = search_minimum(gram, start, linear, PRECISION**2 / freedom, most)
+        if not model.noise:
+            return found, roughness(found.x)
+        return found, model.noise["noise_white"] ** 2 / interval * model.with_vector(found.x).gain() ** 2
 
     return jax.lax.map(one, (campaign, start, most))
-
-
-def _roughness(model: GyroModel, data: Blocks) -> Float[Array, ""]:
-    """Half the mean square of successive differences of the weighted residual: the variance of its white part."""
-    signals, weight = data.whole(), data.weight.ravel()
-    residual = jnp.where(weight > 0, weight * (signals["output"] - model.predict(signals)), 0.0)
-    pairs = (weight[1:] > 0) & (weight[:-1] > 0)
-    return jnp.sum(jnp.where(pairs, jnp.diff(residual), 0.0) ** 2) / 2.0 / jnp.maximum(pairs.sum(), 1)
 
 
 def _searches(data: _Data, tasks: Sequence[tuple[int, np.ndarray]], most: int) -> list[tuple[Search, float]]:
@@ -276,10 +287,9 @@ def _searches(data: _Data, tasks: Sequence[tuple[int, np.ndarray]], most: int) -
 
 
 def _fit_together(campaigns: list[_Campaign], blocks: int, restarts: bool) -> dict[int, _Fitted]:
-    data = _side_by_side(campaigns, blocks)
-    starts = [np.asarray(c.model.vector()) for c in campaigns]
-    first = _searches(data, list(enumerate(starts)), MOST_ITERATIONS)
-    fitted = [_finish(c, *found) for c, found in zip(campaigns, first, strict=True)]
+    data, slots = _side_by_side(campaigns, blocks), campaigns[0].model.slots()
+    first = _searches(data, [(i, c.start) for i, c in enumerate(campaigns)], MOST_ITERATIONS)
+    fitted = [_finish(c, slots, *found) for c, found in zip(campaigns, first, strict=True)]
     bad = [i for i, fit in enumerate(fitted) if restarts and _worth_another_start(fit, first[i][0], data.freedom[i])]
     tried = [(i, x) for i in bad for x in _starts(campaigns[i].model, campaigns[i].record.signals)]
     looked = [found.cost - found.promise for found, _ in _searches(data, tried, 1)]
@@ -288,7 +298,7 @@ def _fit_together(campaigns: list[_Campaign], blocks: int, restarts: bool) -> di
         own = [(cost, k) for k, cost in enumerate(looked) if tried[k][0] == i and np.isfinite(cost)]
         followed += [tried[k] for _, k in sorted(own)[:FOLLOWED]]
     for (i, _), found in zip(followed, _searches(data, followed, MOST_ITERATIONS), strict=True):
-        other = _finish(campaigns[i], *found)
+        other = _finish(campaigns[i], slots, *found)
         better = not other.reason and (fitted[i].reason or other.white < fitted[i].white)
         fitted[i] = (other if better else fitted[i])._replace(restarted=True)
     return {c.place: fit for c, fit in zip(campaigns, fitted, strict=True)}
@@ -305,27 +315,49 @@ def _failed(reason: str) -> _Fitted:
     return _Fitted(np.zeros(0), np.zeros((0, 0)), np.nan, np.nan, 0, False, reason)
 
 
-def _finish(campaign: _Campaign, found: Search, roughness: float) -> _Fitted:
+def _finish(campaign: _Campaign, slots: Sequence[Slot], found: Search, expected: float) -> _Fitted:
     """The estimate where a search ended, or why there is none."""
-    record, p = campaign.record, len(found.x)
+    record, model, p = campaign.record, campaign.model, len(found.x)
     try:
         if not np.isfinite(found.cost):
-            check_covariates(record, campaign.model)
+            check_covariates(record, model)
             raise EstimateError("the model is not finite at its start values: give others")
-        model = checked_solution(campaign.model, found.x, bool(found.converged), int(found.iterations))
-        # Any root of JᵀJ has J's singular values; those lost in its rounding are zero.
-        norm = np.sqrt(np.diag(found.information))
-        values, vectors = np.linalg.eigh(found.information / np.outer(norm, norm) if (norm > 0).all() else np.diag(norm))
-        values = np.where(values > p * np.finfo(float).eps * values.max(initial=0.0), values, 0.0)
-        covariance = unit_covariance(np.sqrt(values)[:, None] * vectors.T * norm, model)
+        if not found.converged or not _possible(model, slots, found.x):
+            checked_solution(model, found.x, bool(found.converged), int(found.iterations))
+        covariance = _inverse(found.information, model)
     except ValueError as problem:
         return _failed(str(problem))._replace(iterations=int(found.iterations))
-    freedom = float(record.present.sum() - p)
-    white = float(found.cost - found.promise) / freedom
-    expected = roughness
-    if model.noise:
-        expected = float(model.noise["noise_white"]) ** 2 / record.interval * float(model.gain()) ** 2
-    return _Fitted(found.x, covariance * white, white, white / expected, int(found.iterations), False, "")
+    white = float(found.cost - found.promise) / float(record.present.sum() - p)
+    return _Fitted(found.x, covariance * white, white, white / float(expected), int(found.iterations), False, "")
+
+
+def _inverse(information: np.ndarray, model: GyroModel) -> np.ndarray:
+    """(JᵀJ)⁻¹; refuses directions that the data do not determine, as far as JᵀJ can tell in its rounding."""
+    size = np.sqrt(np.diag(information))
+    size[size == 0] = 1.0
+    values, vectors = np.linalg.eigh(information / np.outer(size, size))
+    lost = max(SINGULAR**2, len(size) * np.finfo(float).eps) * values.max(initial=0.0)
+    if (values <= lost).any():
+        # A root of JᵀJ stands for J, and what names the effects is the same.
+        unit_covariance(np.sqrt(np.where(values > lost, values, 0.0))[:, None] * vectors.T * size, model)
+    vectors = vectors / size[:, None]
+    return (vectors / values) @ vectors.T
+
+
+def _possible(model: GyroModel, slots: Sequence[Slot], x: np.ndarray) -> bool:
+    """Whether no nonlinear parameter has left what its effect can be."""
+    changed: dict[int, dict[str, np.ndarray]] = {}
+    for slot, value in zip(slots, x, strict=True):
+        if not slot.linear:
+            fields = changed.setdefault(slot.effect, {})
+            old = getattr(model.effects[slot.effect], slot.field)
+            fields.setdefault(slot.field, np.empty(np.shape(old))).flat[slot.index] = value
+    try:
+        for i, values in changed.items():
+            replace(model.effects[i], **values)
+    except ValueError:
+        return False
+    return True
 
 
 def _starts(model: GyroModel, signals: Signals) -> list[np.ndarray]:
