@@ -36,13 +36,13 @@ def thermal_rate_model(parameters: int) -> Any:
     from gyromodel.effects.thermal import BiasTemperatureCurve, BiasWarmup, TemperatureLag
     from gyromodel.model import GyroModel
 
-    hinges = {n: {"hinges": np.zeros(n), "breakpoints": np.linspace(-20.0, 50.0, n + 2)[1:-1]} for n in (4, 11)}
+    hinges = {n: {"hinges": np.zeros(n), "breakpoints": np.linspace(-10.0, 40.0, n)} for n in (11, 14)}
     lag = TemperatureLag(coefficients=np.zeros(4), time_constant=100.0, reference=15.0)
-    spline = ScaleSpline(knots=5 if parameters == 12 else 17, full_rate=1.0, lowest=-1.0)
+    spline = ScaleSpline(knots=5 if parameters == 12 else 7, full_rate=1.0, lowest=-1.0)
     effects = [ScaleFactor(value=1.0), spline, Bias(), lag, BiasWarmup()]
     if parameters == 40:
         effects.append(BiasTemperatureCurve(coefficients=np.zeros(0), reference=15.0, **hinges[11]))
-        effects.append(ScaleTemperatureCurve(coefficients=np.zeros(1), reference=15.0, **hinges[4]))
+        effects.append(ScaleTemperatureCurve(coefficients=np.zeros(1), reference=15.0, **hinges[14]))
     fixed = {("bias_temperature_curve", "breakpoints"), ("scale_temperature_curve", "breakpoints")}
     return GyroModel(tuple(effects), {}, frozenset(fixed))
 
@@ -53,9 +53,11 @@ def truth(model: Any, rng: np.random.Generator) -> np.ndarray:
     for i, slot in enumerate(model.slots()):
         label, draw = model.labels[slot.effect], rng.standard_normal()
         if label == "temperature_lag":
-            x[i] = rng.uniform(-300.0, 300.0) if slot.field == "time_constant" else 2 * DEG_H * draw
+            x[i] = rng.uniform(20.0, 250.0) if slot.field == "time_constant" else 3.0 * 0.3**slot.index * DEG_H * draw
         elif label == "bias_warmup":
-            x[i] = np.exp(rng.uniform(*np.log([150.0, 3000.0]))) if slot.field == "time_constant" else 5 * DEG_H * draw
+            x[i] = 5 * DEG_H * np.sign(draw) * rng.uniform(0.5, 2.0)
+            if slot.field == "time_constant":
+                x[i] = np.exp(rng.uniform(*np.log([150.0, 3000.0])))
         elif label == "bias_temperature_curve":
             x[i] = 0.1 * DEG_H * draw
         else:

@@ -36,10 +36,6 @@ class Blocks(NamedTuple):
     used: Int[Array, ""]
     filter: Filter | None
 
-    def whole(self) -> dict[str, Float[Array, " sample"]]:
-        """The signals in one piece."""
-        return {name: values.ravel() for name, values in self.signals.items()}
-
 
 Known = Mapping[int, Rows]
 Vector = Float[Array, " parameter"]
@@ -55,23 +51,27 @@ def gram_and_roughness(
         residual, which is the variance of its white part.
     """
     free = _free(model)
-    steady: dict[int, Rows] = {}
-    for i, effect in enumerate(model.effects):
-        if effect.site != "gain" and not _shaped(effect, free.get(i, ())):
-            if effect.remembers:
-                steady[i] = _in_blocks(effect.columns(data.whole()).T), None
-            else:
-                steady[i] = jax.lax.map(lambda part, effect=effect: effect.columns(part).T, data.signals), None
+
+    def rows_of(effect: Effect, names: tuple[str, ...]) -> Rows:
+        if effect.remembers:  # it looks at neighbouring samples, and must see all of them
+            whole = {name: values.ravel() for name, values in data.signals.items()}
+            return jax.tree.map(_in_blocks, _rows(effect, whole, names))
+        return _over_blocks(lambda part: _rows(effect, part, names), data)
+
+    steady = {
+        i: rows_of(effect, ())
+        for i, effect in enumerate(model.effects)
+        if effect.site != "gain" and not _shaped(effect, free.get(i, ()))
+    }
 
     def at(x: Vector) -> tuple[GyroModel, Known]:
-        """The model, and rows of effects that look at neighbouring samples: they must see all of them."""
+        """The model and its rows, before they are multiplied by what they act on.
+
+        In a loop of their own: the compiler would compute an exponential again for each row that contains it.
+        """
         now = model.with_vector(x)
-        known = dict(steady)
-        for i, effect in enumerate(now.effects):
-            if effect.remembers and i not in known:
-                linear, shapes = _rows(effect, data.whole(), free[i])
-                known[i] = _in_blocks(linear), None if shapes is None else _in_blocks(shapes)
-        return now, known
+        others = {i: rows_of(e, free[i]) for i, e in enumerate(now.effects) if e.site != "gain" and i not in steady}
+        return now, steady | others
 
     def gram(x: Vector) -> Float[Array, "column column"]:
         now, known = at(x)
@@ -107,6 +107,18 @@ def gram_and_roughness(
         return squares / 2.0 / jnp.maximum(pairs, 1)
 
     return gram, roughness
+
+
+def _over_blocks(rows: Callable[[Signals], Rows], data: Blocks) -> Rows:
+    """Rows of every block that holds samples, zeros elsewhere."""
+    shapes = jax.eval_shape(rows, {name: values[0] for name, values in data.signals.items()})
+    blocks = data.weight.shape[0]
+
+    def put(block, found):
+        part = rows({name: values[block] for name, values in data.signals.items()})
+        return jax.tree.map(lambda all, one: all.at[block].set(one), found, part)
+
+    return jax.lax.fori_loop(0, data.used, put, jax.tree.map(lambda s: jnp.zeros((blocks, *s.shape), s.dtype), shapes))
 
 
 def _in_blocks(rows: Float[Array, "row sample"]) -> Float[Array, "block row sample"]:
@@ -146,12 +158,10 @@ def _stacked(
     """The derivative of the output by each free parameter, and last predicted minus measured output."""
     rate = signals.get("rate", jnp.zeros_like(signals["time"]))
     scale = jnp.ones_like(rate)
-    rows: dict[int, Rows] = {}
     for i, effect in enumerate(model.effects):
         if effect.site == "gain":
             continue
-        rows[i] = known[i] if i in known else _rows(effect, signals, free[i])
-        term = effect.linear() @ rows[i][0]
+        term = effect.linear() @ known[i][0]
         rate, scale = (rate + term, scale) if effect.site == "rate" else (rate, scale + term)
     gain = model.gain()
     prediction = gain * rate * scale
@@ -166,6 +176,6 @@ def _stacked(
             linear = effect.declared()[name].linear
             alike = [k for k, d in effect.declared().items() if d.linear == linear and (linear or k in names)]
             start = sum(np.size(getattr(effect, k)) for k in alike[: alike.index(name)])
-            part = rows[i][0 if linear else 1]
+            part = known[i][0 if linear else 1]
             stacked.append(by * part[start : start + np.size(getattr(effect, name))])  # type: ignore[index]
     return jnp.concatenate([*stacked, (prediction - signals["output"])[None]])

@@ -8,7 +8,8 @@ import threading
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from copy import copy
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import jax
@@ -95,6 +96,7 @@ class _Fitted(NamedTuple):
     iterations: int
     restarted: bool
     reason: str
+    lost: bool = False  # no minimum was found, or one that cannot be
 
 
 def fit_many(
@@ -290,7 +292,8 @@ def _fit_together(campaigns: list[_Campaign], blocks: int, restarts: bool) -> di
     data, slots = _side_by_side(campaigns, blocks), campaigns[0].model.slots()
     first = _searches(data, [(i, c.start) for i, c in enumerate(campaigns)], MOST_ITERATIONS)
     fitted = [_finish(c, slots, *found) for c, found in zip(campaigns, first, strict=True)]
-    bad = [i for i, fit in enumerate(fitted) if restarts and _worth_another_start(fit, first[i][0], data.freedom[i])]
+    limit = 1.0 + BAD_FIT * np.sqrt(2.0 / data.freedom)
+    bad = [i for i, fit in enumerate(fitted) if restarts and (fit.lost or fit.chi > limit[i])]
     tried = [(i, x) for i in bad for x in _starts(campaigns[i].model, campaigns[i].record.signals)]
     looked = [found.cost - found.promise for found, _ in _searches(data, tried, 1)]
     followed = []
@@ -304,29 +307,23 @@ def _fit_together(campaigns: list[_Campaign], blocks: int, restarts: bool) -> di
     return {c.place: fit for c, fit in zip(campaigns, fitted, strict=True)}
 
 
-def _worth_another_start(fit: _Fitted, found: Search, freedom: float) -> bool:
-    """Whether a fit found no minimum though it could look for one, or one that leaves more than the noise."""
-    if fit.reason:
-        return bool(np.isfinite(found.cost)) and not found.converged
-    return fit.chi > 1.0 + BAD_FIT * np.sqrt(2.0 / freedom)
-
-
 def _failed(reason: str) -> _Fitted:
     return _Fitted(np.zeros(0), np.zeros((0, 0)), np.nan, np.nan, 0, False, reason)
 
 
 def _finish(campaign: _Campaign, slots: Sequence[Slot], found: Search, expected: float) -> _Fitted:
     """The estimate where a search ended, or why there is none."""
-    record, model, p = campaign.record, campaign.model, len(found.x)
+    record, model, p, lost = campaign.record, campaign.model, len(found.x), False
     try:
         if not np.isfinite(found.cost):
             check_covariates(record, model)
             raise EstimateError("the model is not finite at its start values: give others")
-        if not found.converged or not _possible(model, slots, found.x):
+        lost = not found.converged or not _possible(model, slots, found.x)
+        if lost:
             checked_solution(model, found.x, bool(found.converged), int(found.iterations))
         covariance = _inverse(found.information, model)
     except ValueError as problem:
-        return _failed(str(problem))._replace(iterations=int(found.iterations))
+        return _failed(str(problem))._replace(iterations=int(found.iterations), lost=lost)
     white = float(found.cost - found.promise) / float(record.present.sum() - p)
     return _Fitted(found.x, covariance * white, white, white / float(expected), int(found.iterations), False, "")
 
@@ -346,15 +343,19 @@ def _inverse(information: np.ndarray, model: GyroModel) -> np.ndarray:
 
 def _possible(model: GyroModel, slots: Sequence[Slot], x: np.ndarray) -> bool:
     """Whether no nonlinear parameter has left what its effect can be."""
-    changed: dict[int, dict[str, np.ndarray]] = {}
+    changed: dict[int, Effect] = {}
     for slot, value in zip(slots, x, strict=True):
         if not slot.linear:
-            fields = changed.setdefault(slot.effect, {})
-            old = getattr(model.effects[slot.effect], slot.field)
-            fields.setdefault(slot.field, np.empty(np.shape(old))).flat[slot.index] = value
+            effect = changed.setdefault(slot.effect, copy(model.effects[slot.effect]))
+            values = np.array(getattr(effect, slot.field))
+            values.flat[slot.index] = value
+            # A new effect with arrays of JAX would take longer than its part of the fit.
+            vars(effect)[slot.field] = values
     try:
-        for i, values in changed.items():
-            replace(model.effects[i], **values)
+        for effect in changed.values():
+            for kind in type(effect).__mro__:
+                if "__check_init__" in vars(kind):
+                    kind.__check_init__(effect)  # type: ignore[attr-defined]
     except ValueError:
         return False
     return True

@@ -86,7 +86,8 @@ def search_minimum(
         now = jnp.where(better, new, state.gram)
         a, g, cost_now = now[:p, :p], now[:p, p], now[p, p]
         scale = jnp.maximum(state.scale, jnp.sqrt(jnp.maximum(jnp.diag(a), 1e-300)))
-        step = -solve_positive(a + jnp.diag(damping * scale**2), g, first & ~linear)
+        # The first step is the exact solve for what is linear.
+        step = -solve_positive(a + jnp.diag(jnp.where(first, 0.0, damping) * scale**2), g, first & ~linear)
         promise = -g @ step
         least = tolerance * cost_now
         # Under heavy damping a small promise says nothing: then the residual must be orthogonal to every column, or the
