@@ -1,7 +1,7 @@
 """The normal equations of one campaign inside a compiled program, gathered block by block.
 
-Rows are parameters and run along the samples, so that they are whole vectors for the processor; a block of them stays in
-cache, the Jacobian as a whole is never stored, and what is padded behind the last sample costs nothing.
+Rows are parameters and run along the samples, so that they are whole vectors for the processor; a block of them stays
+in cache, the Jacobian as a whole is never stored, and what is padded behind the last sample costs nothing.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def _over_blocks(rows: Callable[[Signals], Rows], data: Blocks) -> Rows:
     return jax.lax.fori_loop(0, data.used, put, jax.tree.map(lambda s: jnp.zeros((blocks, *s.shape), s.dtype), shapes))
 
 
-def _in_blocks(rows: Float[Array, "row sample"]) -> Float[Array, "block row sample"]:
+def _in_blocks(rows: Float[Array, "row sample"]) -> Float[Array, "block row part"]:
     """Rows cut into blocks."""
     return rows.reshape(len(rows), -1, BLOCK).swapaxes(0, 1)
 

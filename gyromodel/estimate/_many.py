@@ -6,7 +6,7 @@ import itertools
 import os
 import threading
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass, field
@@ -20,7 +20,14 @@ from jaxtyping import Array, Bool, Float, Int
 from gyromodel.effects import Effect, Signals
 from gyromodel.estimate._blocks import BLOCK, Blocks, gram_and_roughness
 from gyromodel.estimate._estimate import EstimateError
-from gyromodel.estimate._fit import SINGULAR, check_covariates, check_enough, checked_solution, given_ratios, unit_covariance
+from gyromodel.estimate._fit import (
+    SINGULAR,
+    check_covariates,
+    check_enough,
+    checked_solution,
+    given_ratios,
+    unit_covariance,
+)
 from gyromodel.model import GyroModel, Slot, check_units, record_span
 from gyromodel.noise import NoiseRatios, markov_sum
 from gyromodel.numerics.compiled_least_squares import Search, search_minimum
@@ -46,7 +53,7 @@ class ManyFits:
     """Fits of one model structure to many campaigns, in their order; a fit that failed is NaN and has its reason.
 
     Attributes:
-        prepared: each campaign's model before the fit, with what depends on the campaign filled in; `model` has the fit.
+        prepared: each campaign's model before the fit, what depends on the campaign filled in; `model` has the fit.
         values: of the free parameters in the order of `slots()`, internal units.
         covariance: of these.
         white_variance: variance of the white noise of one sample, output unit squared.
@@ -231,7 +238,8 @@ def _side_by_side(campaigns: Sequence[_Campaign], blocks: int) -> _Data:
     noise = None
     if campaigns[0].ratios is not None:
         flat = (TOGETHER, blocks * BLOCK)
-        interval, restart = (padded(part).reshape(flat) for part in list(zip(*(r.sampling for r in records)))[:2])
+        interval = padded(r.sampling.interval for r in records).reshape(flat)
+        restart = padded(r.sampling.restart for r in records).reshape(flat)
         white = padded(r.sampling.white for r in records).reshape(flat)
         noise = _Noise(
             _stacked([c.ratios for c in campaigns]),
@@ -252,13 +260,14 @@ def _stacked(each: Sequence[Any]) -> Any:
     leaves = [[np.asarray(leaf) for leaf in jax.tree.leaves(tree)] for tree in {id(e): e for e in each}.values()]
     order = list({id(e): None for e in each})
     numbers = [order.index(id(e)) for e in each]
-    return jax.tree.unflatten(jax.tree.structure(each[0]), [np.stack(leaf)[numbers] for leaf in zip(*leaves, strict=True)])
+    return jax.tree.unflatten(
+        jax.tree.structure(each[0]), [np.stack(leaf)[numbers] for leaf in zip(*leaves, strict=True)]
+    )
 
 
 @jax.jit
 def _search(data: _Data, campaign, start, most) -> tuple[Search, Float[Array, " task"]]:
     """One search after the other, each of a campaign from a start; and the white variance expected where they end."""
-    linear = np.array([slot.linear for slot in data.models.slots()])
 
     def one(task):
         campaign, start, most = task
@@ -266,6 +275,7 @@ def _search(data: _Data, campaign, start, most) -> tuple[Search, Float[Array, " 
         if noise is not None:
             filter = build_filter(markov_sum(noise.ratios, interval, noise.longest), noise.sampling)
             blocks = blocks._replace(filter=jax.tree.map(lambda v: v.reshape(-1, BLOCK, *v.shape[1:]), filter))
+        linear = np.array([slot.linear for slot in model.slots()], bool)
         gram, roughness = gram_and_roughness(model, blocks)
         found = search_minimum(gram, start, linear, PRECISION**2 / freedom, most)
         if not model.noise:
@@ -313,19 +323,21 @@ def _failed(reason: str) -> _Fitted:
 
 def _finish(campaign: _Campaign, slots: Sequence[Slot], found: Search, expected: float) -> _Fitted:
     """The estimate where a search ended, or why there is none."""
-    record, model, p, lost = campaign.record, campaign.model, len(found.x), False
+    record, model, x, iterations = campaign.record, campaign.model, found.x, int(found.iterations)
+    white = float(found.cost - found.promise) / float(record.present.sum() - len(x))
+    chi = white / float(expected) if np.isfinite(white) else np.nan
+    lost = False
     try:
         if not np.isfinite(found.cost):
             check_covariates(record, model)
             raise EstimateError("the model is not finite at its start values: give others")
-        lost = not found.converged or not _possible(model, slots, found.x)
+        lost = not found.converged or not _possible(model, slots, x)
         if lost:
-            checked_solution(model, found.x, bool(found.converged), int(found.iterations))
-        covariance = _inverse(found.information, model)
+            checked_solution(model, x, bool(found.converged), iterations)
+        covariance = _inverse(found.information, model) * white
     except ValueError as problem:
-        return _failed(str(problem))._replace(iterations=int(found.iterations), lost=lost)
-    white = float(found.cost - found.promise) / float(record.present.sum() - p)
-    return _Fitted(found.x, covariance * white, white, white / float(expected), int(found.iterations), False, "")
+        return _failed(str(problem))._replace(chi=chi, iterations=iterations, lost=lost)
+    return _Fitted(x, covariance, white, chi, iterations, False, "")
 
 
 def _inverse(information: np.ndarray, model: GyroModel) -> np.ndarray:
@@ -369,7 +381,10 @@ def _starts(model: GyroModel, signals: Signals) -> list[np.ndarray]:
         own = [k for k, slot in enumerate(slots) if slot.effect == i and not slot.linear]
         if not own:
             continue
-        forms = [np.array([np.ravel(getattr(e, slots[k].field))[slots[k].index] for k in own]) for e in _alike(effect, signals)]
+        forms = [
+            np.array([np.ravel(getattr(e, slots[k].field))[slots[k].index] for k in own])
+            for e in _alike(effect, signals)
+        ]
         if forms:
             levels.append([(own, values) for values in forms])
             continue

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from gyromodel.numerics.least_squares import FIRST_DAMPING, KINK_TOLERANCE, LEAST_DAMPING
@@ -19,6 +20,8 @@ from gyromodel.numerics.least_squares import FIRST_DAMPING, KINK_TOLERANCE, LEAS
 LEAST_PIVOT = 1e-14
 # Relative decreases of the cost below this are lost in its rounding.
 ROUNDING = 1e-13
+# Part of the damping that what is linear gets: alone it would need none, and products of it need some.
+LINEAR_SHARE = 1e-4
 
 
 class Search(NamedTuple):
@@ -48,7 +51,7 @@ class _State(NamedTuple):
 def search_minimum(
     gram: Callable[[Float[Array, " parameter"]], Float[Array, "column column"]],
     start: Float[Array, " parameter"],
-    linear: Bool[Array, " parameter"],
+    linear: Bool[Array | np.ndarray, " parameter"],
     tolerance: Float[Array, ""] | float,
     most: Int[Array, ""] | int,
 ) -> Search:
@@ -67,6 +70,11 @@ def search_minimum(
     """
     p = start.shape[0]
     tolerance = jnp.maximum(tolerance, ROUNDING)
+    held = ~jnp.asarray(linear) & jnp.any(linear)
+
+    def metric(scale):
+        """What the damping multiplies; a long step of what is linear is no danger."""
+        return scale**2 * jnp.where(linear, LINEAR_SHARE, 1.0)
 
     def look(state: _State) -> _State:
         new = gram(state.x + state.step)
@@ -76,7 +84,8 @@ def search_minimum(
         better = jnp.isfinite(new).all() & (cost <= before)
         decrease = before - cost
         # Decrease over what the linear model promised: near one, the damping falls (Nielsen 1999, equation 2.4).
-        ratio = decrease / (state.promise + state.damping * jnp.sum((state.scale * state.step) ** 2))
+        promised = state.promise + state.damping * jnp.sum(metric(state.scale) * state.step**2)
+        ratio = jnp.where(promised > 0, decrease / jnp.where(promised > 0, promised, 1.0), 1.0)
         eased = jnp.maximum(state.damping * jnp.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3), LEAST_DAMPING)
         eased = jnp.where(ratio < 0.25, jnp.maximum(eased, FIRST_DAMPING), eased)
         eased = jnp.where(first, state.damping, eased)
@@ -87,14 +96,14 @@ def search_minimum(
         a, g, cost_now = now[:p, :p], now[:p, p], now[p, p]
         scale = jnp.maximum(state.scale, jnp.sqrt(jnp.maximum(jnp.diag(a), 1e-300)))
         # The first step is the exact solve for what is linear.
-        step = -solve_positive(a + jnp.diag(jnp.where(first, 0.0, damping) * scale**2), g, first & ~linear)
+        step = -solve_positive(a + jnp.diag(jnp.where(first, 0.0, damping) * metric(scale)), g, first & held)
         promise = -g @ step
         least = tolerance * cost_now
         # Under heavy damping a small promise says nothing: then the residual must be orthogonal to every column, or the
         # last step, so short that it cost next to nothing, still led up, as where the cost has a kink.
         orthogonal = jnp.all(jnp.abs(g) <= 1e-6 * scale * jnp.sqrt(cost_now))
         kink = ~better & (-decrease <= KINK_TOLERANCE * least)
-        small = (promise <= least) & (~first | linear.all())
+        small = (promise <= least) & ~(first & held.any())
         settled = better & (decrease <= least) & (state.iteration > 1)
         hopeless = first & ~better
         return _State(
