@@ -157,7 +157,7 @@ def scipy_loop(parameters: int, method: str, tight: bool = False) -> dict[str, A
     import jax
     from scipy.optimize import least_squares
 
-    from gyromodel.estimate._many import _key, _ready
+    from gyromodel.estimate._together import kind_of, ready
 
     model = thermal_rate_model(parameters)
     start, size = np.asarray(model.vector()), _typical(model)
@@ -172,7 +172,7 @@ def scipy_loop(parameters: int, method: str, tight: bool = False) -> dict[str, A
         return model.with_vector(u * size).linearise(signals)[1] * (size / (SIGMA * DEG_H))
 
     given = np.asarray(model.vector())
-    lengths = [512 * _key(_ready(0, r, model, given))[0] for r in records]
+    lengths = [512 * kind_of(ready(0, r, model, given))[0] for r in records]
     padded = [
         {k: np.pad(v, (0, n - r.rows), mode="edge") for k, v in r.signals.items()}
         for r, n in zip(records, lengths, strict=True)
@@ -274,15 +274,16 @@ def one_pass(parameters: int) -> dict[str, Any]:
 
 def compiling(parameters: int) -> dict[str, Any]:
     """The program of the longest bucket: time to trace and to compile, temporary memory."""
-    from gyromodel.estimate import _many
+    from gyromodel.estimate import _together
 
     model = thermal_rate_model(parameters)
     start = np.asarray(model.vector())
-    waiting = [_many._ready(i, r, model, start) for i, r in enumerate(campaigns(model, _many.TOGETHER, (6000, 6500)))]
-    data = _many._side_by_side(waiting, 16)
-    tasks = np.arange(_many.TOGETHER), np.stack([c.start for c in waiting]), np.full(_many.TOGETHER, 100)
+    records = campaigns(model, _together.TOGETHER, (6000, 6500))
+    waiting = [_together.ready(i, r, model, start) for i, r in enumerate(records)]
+    data = _together.side_by_side(waiting, 16)
+    tasks = np.arange(_together.TOGETHER), np.stack([c.start for c in waiting]), np.full(_together.TOGETHER, 100)
     before = time.perf_counter()
-    lowered = _many._search.lower(data, *tasks)
+    lowered = _together.search.lower(data, *tasks)
     traced = time.perf_counter()
     compiled = lowered.compile()
     done = time.perf_counter()
@@ -355,9 +356,9 @@ def _page(ragged, mine, loops, exact, batches, passes, compiled, by_samples, by_
     best = {p: min(loops[p, m]["cpu"] for m in ("lm", "trf")) / per_fit[p]["cpu"] for p in (12, 40)}
     agree = {p: _apart(exact[p]["values"], mine[p]) for p in (12, 40)}
     lines = [
-        f"Spline scale factor, bias a quartic of the lagged temperature, warm-up; with 40 parameters also {11 + 14} hinges "
-        f"over temperature. Campaigns of {LENGTHS[0]} to {LENGTHS[1]} samples, white noise of unknown size. Milliseconds a "
-        "fit on one processor core, the second call in a fresh process (the first compiles); ratios are of processor "
+        "Spline scale factor, bias a quartic of the lagged temperature, warm-up; with 40 parameters also 25 hinges "
+        f"over temperature. Campaigns of {LENGTHS[0]} to {LENGTHS[1]} samples, white noise of unknown size. "
+        "Milliseconds a fit on one processor core, the second call in a fresh process (the first compiles); ratios are of processor "
         "time. Reading campaigns, with the smoothing of their thermometers, is not in it. Peers were measured on the "
         "first of the same campaigns, and have the same structured columns, compiled, and scaled parameters; scipy at "
         "its default tolerances, optimistix at 1e-8.",
@@ -423,9 +424,9 @@ def _page(ragged, mine, loops, exact, batches, passes, compiled, by_samples, by_
             ],
         ),
         "",
-        f"One Jacobian of 8192 samples has {8192 * 13 * 8 / 1e6:.2f} and {8192 * 41 * 8 / 1e6:.2f} MB. optimistix takes "
-        f"{batches['vmap']['temporary'] / 1e6:.0f} MB for {STOCK} campaigns under vmap. While {ragged[12]} campaigns "
-        f"were fitted the largest resident memory rose by {(mine[12]['peak'] - mine[12]['before']) / MIB:.0f} MiB.",
+        f"One Jacobian of 8192 samples has {8192 * 13 * 8 / 1e6:.2f} and {8192 * 41 * 8 / 1e6:.2f} MB. optimistix "
+        f"takes {batches['vmap']['temporary'] / 1e6:.0f} MB for {STOCK} campaigns under vmap. While {ragged[12]} "
+        f"campaigns were fitted the largest resident memory rose by {(mine[12]['peak'] - mine[12]['before']) / MIB:.0f} MiB.",
         "",
         "## Cost over samples and campaigns",
         "",

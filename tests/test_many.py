@@ -17,7 +17,7 @@ from gyromodel.effects.drivers import Bias
 from gyromodel.effects.dynamics import TimeDelay
 from gyromodel.effects.scale import ScaleFactor
 from gyromodel.effects.thermal import BiasTemperature, BiasWarmup
-from gyromodel.estimate import EstimateError, _many, fit_many, fit_record
+from gyromodel.estimate import EstimateError, _together, fit_many, fit_record
 from gyromodel.model import GyroModel
 from gyromodel.noise import NoiseRatios
 from gyromodel.numerics.compiled_least_squares import search_minimum, solve_positive
@@ -97,14 +97,14 @@ def test_values_are_scipys_on_the_equation(rng: np.random.Generator):
 
 def test_one_trace_for_each_power_of_two_of_lengths(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch):
     traces: list[int] = []
-    _many._search.clear_cache()
-    whole = _many.gram_and_roughness
+    _together.search.clear_cache()
+    whole = _together.gram_and_roughness
 
     def counted(model, data):
         traces.append(data.weight.shape[0])
         return whole(model, data)
 
-    monkeypatch.setattr(_many, "gram_and_roughness", counted)
+    monkeypatch.setattr(_together, "gram_and_roughness", counted)
     base = [campaign(rng, rows) for rows in (200, 400, 600)]
     records = [again(base[i % 3], rng) for i in range(70)]
     fit_many(records, thermal_model(), threads=3)

@@ -7,12 +7,12 @@ in cache, the Jacobian as a whole is never stored, and what is padded behind the
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from gyromodel.effects import Effect, Signals
 from gyromodel.model import GyroModel
@@ -25,15 +25,15 @@ Rows = tuple[Float[Array, "*block coefficient sample"], Float[Array, "*block sha
 
 
 class Blocks(NamedTuple):
-    """A campaign's samples in blocks.
+    """A campaign's samples in blocks, or many campaigns' with one axis more.
 
-    `weight` is one over the white noise relative to its unit, zero where there is no sample; `used` counts the blocks
-    that hold samples; with `filter` the noise is coloured.
+    Of signals and `weight` the axes are block and sample. `weight` is one over the white noise relative to its unit,
+    zero where there is no sample; `used` counts the blocks that hold samples; with `filter` the noise is coloured.
     """
 
-    signals: Mapping[str, Float[Array, "block sample"]]
-    weight: Float[Array, "block sample"]
-    used: Int[Array, ""]
+    signals: Mapping[str, Any]
+    weight: Any
+    used: Any
     filter: Filter | None
 
 

@@ -271,7 +271,7 @@ def unit_covariance(whitened_jacobian: np.ndarray, model: GyroModel) -> np.ndarr
     _, singular, directions = np.linalg.svd(r)
     weak = directions[singular < SINGULAR * singular[0]]
     if len(weak):
-        names = " and ".join(_named(model, (np.abs(weak) > 0.1).any(axis=0)))
+        names = " and ".join(_named(model, np.abs(weak).max(axis=0) > 0.1))
         raise EstimateError(
             f"{names} cannot be told apart on this campaign: fix all but one, or measure where they differ"
         )

@@ -12,34 +12,20 @@ from copy import copy
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from gyromodel.effects import Effect, Signals
-from gyromodel.estimate._blocks import BLOCK, Blocks, gram_and_roughness
 from gyromodel.estimate._estimate import EstimateError
-from gyromodel.estimate._fit import (
-    SINGULAR,
-    check_covariates,
-    check_enough,
-    checked_solution,
-    given_ratios,
-    unit_covariance,
-)
-from gyromodel.model import GyroModel, Slot, check_units, record_span
-from gyromodel.noise import NoiseRatios, markov_sum
-from gyromodel.numerics.compiled_least_squares import Search, search_minimum
-from gyromodel.numerics.state_space import Sampling, build_filter
+from gyromodel.estimate._fit import SINGULAR, check_covariates, checked_solution, unit_covariance
+from gyromodel.estimate._together import TOGETHER, Waiting, kind_of, ready, searches, side_by_side
+from gyromodel.model import GyroModel, Slot
+from gyromodel.numerics.compiled_least_squares import Search
 from gyromodel.signals import Record
 from gyromodel.units import factor, internal_unit
 
-# Campaigns handed to the compiled program in one call.
-TOGETHER = 16
 MOST_ITERATIONS = 100
-# Distance from the minimum, in standard deviations of the parameters, at which a search ends with one more step.
-PRECISION = 1e-3
 # Standard deviations by which chi-squared may lie above its degrees of freedom before other starts are tried.
 BAD_FIT = 5.0
 # Starts looked at where a fit is bad, and how many of the best are followed to their minimum.
@@ -85,16 +71,6 @@ class ManyFits:
         return self.prepared[campaign].with_vector(self.values[campaign])
 
 
-class _Campaign(NamedTuple):
-    """One that waits to be fitted: where it stands, its data, and its prepared model."""
-
-    place: int
-    record: Record
-    model: GyroModel
-    start: np.ndarray
-    ratios: NoiseRatios | None
-
-
 class _Fitted(NamedTuple):
     x: np.ndarray
     covariance: np.ndarray
@@ -134,11 +110,11 @@ def fit_many(
     prepared: list[GyroModel] = []
     given = np.asarray(model.vector())
     done: dict[int, _Fitted] = {}
-    waiting: dict[Any, list[_Campaign]] = {}
+    waiting: dict[Any, list[Waiting]] = {}
     compiled: dict[Any, threading.Event] = {}
     running: deque[Future[dict[int, _Fitted]]] = deque()
 
-    def work(key: Any, campaigns: list[_Campaign], first: bool) -> dict[int, _Fitted]:
+    def work(key: Any, campaigns: list[Waiting], first: bool) -> dict[int, _Fitted]:
         # The first of a kind compiles; the others wait for its program instead of compiling it too.
         if not first:
             compiled[key].wait()
@@ -159,12 +135,12 @@ def fit_many(
         for place, record in enumerate(records):
             prepared.append(model)
             try:
-                campaign = _ready(place, record, model, given)
+                campaign = ready(place, record, model, given)
             except ValueError as problem:
                 done[place] = _failed(str(problem))
                 continue
             prepared[place] = campaign.model
-            key = _key(campaign)
+            key = kind_of(campaign)
             waiting.setdefault(key, []).append(campaign)
             if len(waiting[key]) == TOGETHER:
                 start(key)
@@ -179,138 +155,19 @@ def _processors() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _ready(place: int, record: Record, model: GyroModel, given: np.ndarray) -> _Campaign:
-    """The campaign with its prepared model; ModelError or EstimateError where it cannot be fitted."""
-    check_units(model, record.output_unit, record.units)
-    prepared = model.prepared(record.signals)
-    start = given if prepared is model else np.asarray(prepared.vector())
-    check_enough(record, len(start))
-    ratios = given_ratios(record, prepared)
-    coloured = ratios is not None and any(float(r) > 0 for r in ratios[:3])
-    return _Campaign(place, record, prepared, start, ratios if coloured else None)
-
-
-def _key(campaign: _Campaign) -> tuple:
-    """What must be alike for one program: blocks (a power of two), model structure, signals, colour of the noise."""
-    blocks = 2 ** max(int(np.ceil(np.log2(campaign.record.rows / BLOCK))), 0)
-    leaves, structure = jax.tree.flatten(campaign.model)
-    shapes = tuple(np.shape(leaf) for leaf in leaves)
-    return blocks, structure, shapes, tuple(sorted(campaign.record.signals)), campaign.ratios is None
-
-
-class _Noise(NamedTuple):
-    """Coloured noise of a campaign: ratios, longest time constant (s), and the sampling."""
-
-    ratios: NoiseRatios
-    longest: Float[Array, ""]
-    sampling: Sampling
-
-
-class _Data(NamedTuple):
-    """Campaigns side by side, the first axis of every array."""
-
-    models: GyroModel
-    blocks: Blocks
-    noise: _Noise | None
-    interval: Float[np.ndarray, " campaign"]
-    freedom: Float[np.ndarray, " campaign"]
-
-
-def _side_by_side(campaigns: Sequence[_Campaign], blocks: int) -> _Data:
-    """Arrays of a fixed size, whatever the number of campaigns: the first stands in for those that lack."""
-    campaigns = [*campaigns, *campaigns[:1] * (TOGETHER - len(campaigns))]
-    records = [c.record for c in campaigns]
-
-    def padded(each: Iterable[Any]) -> np.ndarray:
-        """Each continued by its last value."""
-        first, *others = (np.asarray(values) for values in each)
-        together = np.empty((TOGETHER, blocks * BLOCK), first.dtype)
-        for row, values, record in zip(together, (first, *others), records, strict=True):
-            row[: record.rows] = values[: record.rows]
-            row[record.rows :] = values[record.rows - 1]
-        return together.reshape(TOGETHER, blocks, BLOCK)
-
-    rows = np.arange(blocks * BLOCK).reshape(blocks, BLOCK) < np.array([r.rows for r in records])[:, None, None]
-    signals = {name: padded(r.signals[name] for r in records) for name in records[0].signals}
-    present = padded(r.sampling.present for r in records) & rows
-    weight = present / np.sqrt(padded(r.sampling.white for r in records))
-    used = np.array([-(-r.rows // BLOCK) for r in records])
-    noise = None
-    if campaigns[0].ratios is not None:
-        flat = (TOGETHER, blocks * BLOCK)
-        interval = padded(r.sampling.interval for r in records).reshape(flat)
-        restart = padded(r.sampling.restart for r in records).reshape(flat)
-        white = padded(r.sampling.white for r in records).reshape(flat)
-        noise = _Noise(
-            _stacked([c.ratios for c in campaigns]),
-            np.array([float(c.ratios.longest(record_span(c.record))) for c in campaigns]),
-            Sampling(interval, restart, present.reshape(flat), white),
-        )
-    return _Data(
-        _stacked([c.model for c in campaigns]),
-        Blocks(signals, weight, used, None),
-        noise,
-        np.array([r.interval for r in records]),
-        np.array([float(r.present.sum() - len(c.start)) for r, c in zip(records, campaigns, strict=True)]),
-    )
-
-
-def _stacked(each: Sequence[Any]) -> Any:
-    """Trees of arrays as one whose arrays have a first axis more."""
-    leaves = [[np.asarray(leaf) for leaf in jax.tree.leaves(tree)] for tree in {id(e): e for e in each}.values()]
-    order = list({id(e): None for e in each})
-    numbers = [order.index(id(e)) for e in each]
-    return jax.tree.unflatten(
-        jax.tree.structure(each[0]), [np.stack(leaf)[numbers] for leaf in zip(*leaves, strict=True)]
-    )
-
-
-@jax.jit
-def _search(data: _Data, campaign, start, most) -> tuple[Search, Float[Array, " task"]]:
-    """One search after the other, each of a campaign from a start; and the white variance expected where they end."""
-
-    def one(task):
-        campaign, start, most = task
-        model, blocks, noise, interval, freedom = jax.tree.map(lambda values: values[campaign], data)
-        if noise is not None:
-            filter = build_filter(markov_sum(noise.ratios, interval, noise.longest), noise.sampling)
-            blocks = blocks._replace(filter=jax.tree.map(lambda v: v.reshape(-1, BLOCK, *v.shape[1:]), filter))
-        linear = np.array([slot.linear for slot in model.slots()], bool)
-        gram, roughness = gram_and_roughness(model, blocks)
-        found = search_minimum(gram, start, linear, PRECISION**2 / freedom, most)
-        if not model.noise:
-            return found, roughness(found.x)
-        return found, model.noise["noise_white"] ** 2 / interval * model.with_vector(found.x).gain() ** 2
-
-    return jax.lax.map(one, (campaign, start, most))
-
-
-def _searches(data: _Data, tasks: Sequence[tuple[int, np.ndarray]], most: int) -> list[tuple[Search, float]]:
-    """Searches of campaigns from starts, so many in a call that its arrays have a fixed size."""
-    found = []
-    for first in range(0, len(tasks), TOGETHER):
-        some = tasks[first : first + TOGETHER]
-        lack = TOGETHER - len(some)
-        campaign = np.array([i for i, _ in some] + [0] * lack)
-        start = np.stack([x for _, x in some] + [some[0][1]] * lack)
-        results = jax.tree.map(np.asarray, _search(data, campaign, start, np.array([most] * len(some) + [0] * lack)))
-        found += [jax.tree.map(lambda values, k=k: values[k], results) for k in range(len(some))]
-    return found
-
-
-def _fit_together(campaigns: list[_Campaign], blocks: int, restarts: bool) -> dict[int, _Fitted]:
-    data, slots = _side_by_side(campaigns, blocks), campaigns[0].model.slots()
-    first = _searches(data, [(i, c.start) for i, c in enumerate(campaigns)], MOST_ITERATIONS)
+def _fit_together(campaigns: list[Waiting], blocks: int, restarts: bool) -> dict[int, _Fitted]:
+    data, slots = side_by_side(campaigns, blocks), campaigns[0].model.slots()
+    first = searches(data, [(i, c.start) for i, c in enumerate(campaigns)], MOST_ITERATIONS)
     fitted = [_finish(c, slots, *found) for c, found in zip(campaigns, first, strict=True)]
     limit = 1.0 + BAD_FIT * np.sqrt(2.0 / data.freedom)
     bad = [i for i, fit in enumerate(fitted) if restarts and (fit.lost or fit.chi > limit[i])]
     tried = [(i, x) for i in bad for x in _starts(campaigns[i].model, campaigns[i].record.signals)]
-    looked = [found.cost - found.promise for found, _ in _searches(data, tried, 1)]
+    looked = [found.cost - found.promise for found, _ in searches(data, tried, 1)]
     followed = []
     for i in {i for i, _ in tried}:
         own = [(cost, k) for k, cost in enumerate(looked) if tried[k][0] == i and np.isfinite(cost)]
         followed += [tried[k] for _, k in sorted(own)[:FOLLOWED]]
-    for (i, _), found in zip(followed, _searches(data, followed, MOST_ITERATIONS), strict=True):
+    for (i, _), found in zip(followed, searches(data, followed, MOST_ITERATIONS), strict=True):
         other = _finish(campaigns[i], slots, *found)
         better = not other.reason and (fitted[i].reason or other.white < fitted[i].white)
         fitted[i] = (other if better else fitted[i])._replace(restarted=True)
@@ -321,9 +178,9 @@ def _failed(reason: str) -> _Fitted:
     return _Fitted(np.zeros(0), np.zeros((0, 0)), np.nan, np.nan, 0, False, reason)
 
 
-def _finish(campaign: _Campaign, slots: Sequence[Slot], found: Search, expected: float) -> _Fitted:
+def _finish(campaign: Waiting, slots: Sequence[Slot], found: Search, expected: float) -> _Fitted:
     """The estimate where a search ended, or why there is none."""
-    record, model, x, iterations = campaign.record, campaign.model, found.x, int(found.iterations)
+    record, model, x, iterations = campaign.record, campaign.model, np.asarray(found.x), int(found.iterations)
     white = float(found.cost - found.promise) / float(record.present.sum() - len(x))
     chi = white / float(expected) if np.isfinite(white) else np.nan
     lost = False
@@ -334,7 +191,7 @@ def _finish(campaign: _Campaign, slots: Sequence[Slot], found: Search, expected:
         lost = not found.converged or not _possible(model, slots, x)
         if lost:
             checked_solution(model, x, bool(found.converged), iterations)
-        covariance = _inverse(found.information, model) * white
+        covariance = _inverse(np.asarray(found.information), model) * white
     except ValueError as problem:
         return _failed(str(problem))._replace(chi=chi, iterations=iterations, lost=lost)
     return _Fitted(x, covariance, white, chi, iterations, False, "")
