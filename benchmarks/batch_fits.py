@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks._measure import in_fresh_process, peak_memory, timed, write_result
+from benchmarks._measure import MIB, in_fresh_process, peak_memory, table, timed, write_result
 
 STEP, SIGMA = 2.0, 0.5
 LENGTHS = 3500, 6500
@@ -358,9 +358,9 @@ def _page(ragged, mine, loops, exact, batches, passes, compiled, by_samples, by_
     lines = [
         "Spline scale factor, bias a quartic of the lagged temperature, warm-up; with 40 parameters also 25 hinges "
         f"over temperature. Campaigns of {LENGTHS[0]} to {LENGTHS[1]} samples, white noise of unknown size. "
-        "Milliseconds a fit on one processor core, the second call in a fresh process (the first compiles); ratios are of processor "
-        "time. Reading campaigns, with the smoothing of their thermometers, is not in it. Peers were measured on the "
-        "first of the same campaigns, and have the same structured columns, compiled, and scaled parameters; scipy at "
+        "Milliseconds a fit on one processor core, the second call in a fresh process (the first compiles); ratios are "
+        "of processor time. Reading campaigns, with the smoothing of their thermometers, is not in it. Peers were measured "
+        "on the first of the same campaigns, and have the same structured columns, compiled, and scaled parameters; scipy at "
         "its default tolerances, optimistix at 1e-8.",
         "",
         *table(["parameters", "method", "wall ms", "processor ms", "ratio", "iterations"], rows),
@@ -426,7 +426,8 @@ def _page(ragged, mine, loops, exact, batches, passes, compiled, by_samples, by_
         "",
         f"One Jacobian of 8192 samples has {8192 * 13 * 8 / 1e6:.2f} and {8192 * 41 * 8 / 1e6:.2f} MB. optimistix "
         f"takes {batches['vmap']['temporary'] / 1e6:.0f} MB for {STOCK} campaigns under vmap. While {ragged[12]} "
-        f"campaigns were fitted the largest resident memory rose by {(mine[12]['peak'] - mine[12]['before']) / MIB:.0f} MiB.",
+        "campaigns were fitted the largest resident memory rose by "
+        f"{(mine[12]['peak'] - mine[12]['before']) / MIB:.0f} MiB.",
         "",
         "## Cost over samples and campaigns",
         "",
