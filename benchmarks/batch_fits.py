@@ -359,9 +359,9 @@ def _page(ragged, mine, loops, exact, batches, passes, compiled, by_samples, by_
         "Spline scale factor, bias a quartic of the lagged temperature, warm-up; with 40 parameters also 25 hinges "
         f"over temperature. Campaigns of {LENGTHS[0]} to {LENGTHS[1]} samples, white noise of unknown size. "
         "Milliseconds a fit on one processor core, the second call in a fresh process (the first compiles); ratios are "
-        "of processor time. Reading campaigns, with the smoothing of their thermometers, is not in it. Peers were measured "
-        "on the first of the same campaigns, and have the same structured columns, compiled, and scaled parameters; scipy at "
-        "its default tolerances, optimistix at 1e-8.",
+        "of processor time. Reading campaigns, with the smoothing of their thermometers, is not in it. Peers were "
+        "measured on the first of the same campaigns, and have the same structured columns, compiled, and scaled "
+        "parameters; scipy at its default tolerances, optimistix at 1e-8.",
         "",
         *table(["parameters", "method", "wall ms", "processor ms", "ratio", "iterations"], rows),
         "",

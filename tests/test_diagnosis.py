@@ -160,6 +160,7 @@ def test_an_effect_whose_fit_fails_is_told_and_not_tried_again(monkeypatch: pyte
     assert any("bias_temperature is still significant" in line for line in found.findings)
 
 
+@pytest.mark.long
 def test_diagnosing_the_extended_model_finds_nothing_more(rng: np.random.Generator) -> None:
     ramp = 8.0 * np.sin(2 * np.pi * 20.0 * np.arange(ROWS) / 4000.0)
     campaign = static_log(rng, ramp)
@@ -212,6 +213,7 @@ def test_ring_laser_table_is_four_points_or_a_curve() -> None:
     assert line["scale_factor"].value == pytest.approx(77348, abs=20)
 
 
+@pytest.mark.long
 def test_fiber_optic_rig_is_named_and_the_error_falls(measured_data) -> None:
     campaign = gm.read_campaign(measured_data("fog_rate_temperature/campaign.csv.gz"))
     found = gm.diagnose(campaign, gm.model_from_effects(["scale_factor", "bias"]))
@@ -307,6 +309,7 @@ def test_several_lines_are_one_cause(rng: np.random.Generator) -> None:
     assert frequency == pytest.approx([0.0031, 0.0117], abs=tolerance)
 
 
+@pytest.mark.long
 def test_many_gross_errors_are_given_up_together(rng: np.random.Generator) -> None:
     """More of them than the search has rounds, beside a bias over temperature."""
     wild = np.sort(rng.choice(ROWS // 5, 20, replace=False)) * 5

@@ -121,6 +121,7 @@ def test_a_level_that_follows_a_column_is_no_structure(seed: int):
     assert any("noise level follows" in line for line in found.findings)
 
 
+@pytest.mark.long
 def test_a_regular_switch_is_no_firm_noise():
     """Examples with a fixed seed: square waves are as well something that switches near the gyro, a thermostat say."""
     rng = np.random.default_rng(2)
