@@ -35,7 +35,7 @@ def thermal_rate_model(parameters: int) -> Any:
     from gyromodel.effects.thermal import BiasTemperatureCurve, BiasWarmup, TemperatureLag
     from gyromodel.model import GyroModel
 
-    hinges = {n: {"hinges": np.zeros(n), "breakpoints": np.linspace(-10.0, 40.0, n)} for n in (11, 14)}
+    hinges = {n: {"hinges": np.zeros(n), "breakpoints": np.linspace(0.0, 30.0, n)} for n in (11, 14)}
     lag = TemperatureLag(coefficients=np.zeros(4), time_constant=100.0, reference=15.0)
     spline = ScaleSpline(knots=5 if parameters == 12 else 7, full_rate=1.0, lowest=-1.0)
     effects = [ScaleFactor(value=1.0), spline, Bias(), lag, BiasWarmup()]

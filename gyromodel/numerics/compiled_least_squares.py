@@ -98,25 +98,27 @@ def search_minimum(
         # The first step is the exact solve for what is linear.
         step = -solve_positive(a + jnp.diag(jnp.where(first, 0.0, damping) * metric(scale)), g, first & held)
         promise = -g @ step
+        # A damped step may be short far from the minimum; what the whole one promises tells how far it is.
+        whole = -solve_positive(a, g, jnp.zeros(p, bool))
         least = tolerance * cost_now
-        # Under heavy damping a small promise says nothing: then the residual must be orthogonal to every column, or the
-        # last step, so short that it cost next to nothing, still led up, as where the cost has a kink.
+        near = -g @ whole <= least
+        # Where damping has made every step short: at the minimum the residual is orthogonal to every column, or the
+        # last step cost or gained next to nothing, as where the cost has a kink.
+        short = (promise <= least) & ~(first & held.any())
         orthogonal = jnp.all(jnp.abs(g) <= 1e-6 * scale * jnp.sqrt(cost_now))
-        kink = ~better & (-decrease <= KINK_TOLERANCE * least)
-        small = (promise <= least) & ~(first & held.any())
-        settled = better & (decrease <= least) & (state.iteration > 1)
+        kink = jnp.abs(decrease) <= KINK_TOLERANCE * least
         hopeless = first & ~better
         return _State(
             x,
             now,
             scale,
-            jnp.where(hopeless, 0.0, step),
+            jnp.where(near, whole, step),
             promise,
             damping,
             growth,
             state.iteration + 1,
-            small | settled | hopeless,
-            (small & ((damping < 1.0) | orthogonal | kink)) | settled,
+            near | short | hopeless,
+            near | (short & (orthogonal | kink)),
         )
 
     nothing = jnp.full((p + 1, p + 1), jnp.inf)
