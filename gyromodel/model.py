@@ -101,6 +101,9 @@ class GyroModel(eqx.Module):
     def check_columns(self, signals: Signals) -> None:
         """Refuse signals without a column that an effect needs."""
         for effect in self.effects:
+            # Whether a scale factor is fixed takes longer to say than that nothing is lacking.
+            if not lacking(effect.columns_needed, signals):
+                continue
             for name in lacking(self.columns_needed(effect), signals):
                 close = get_close_matches(effect.label, CATALOGUE, n=1) if isinstance(effect, BiasColumn) else []
                 hint = f"; did you mean {close[0]}?" if close else ""
@@ -109,7 +112,10 @@ class GyroModel(eqx.Module):
     def prepared(self, signals: Signals) -> GyroModel:
         """Reference points and start values that depend on the campaign filled in."""
         self.check_columns(signals)
-        return eqx.tree_at(lambda m: m.effects, self, tuple(e.prepared(signals) for e in self.effects))
+        effects = tuple(e.prepared(signals) for e in self.effects)
+        if all(a is b for a, b in zip(effects, self.effects, strict=True)):
+            return self
+        return eqx.tree_at(lambda m: m.effects, self, effects)
 
     def slots(self) -> tuple[Slot, ...]:
         """The free parameters, in the order of the parameter vector."""

@@ -84,6 +84,7 @@ class Problem(NamedTuple):
     sum_of_squares: float
     freedom: int
     normal: Callable[[np.ndarray], Normal]
+    traced: Callable[[Array], tuple[Array, Array, Array]]
 
 
 @lru_cache
@@ -108,7 +109,7 @@ def load(folder: Path, name: str) -> Problem:
         a, g, cost = parts(jnp.asarray(b))
         return np.asarray(a), np.asarray(g), float(cost)
 
-    return Problem(rows[:, :2].T, rows[:, 2], rows[:, 3], total, len(y) - len(rows), normal)
+    return Problem(rows[:, :2].T, rows[:, 2], rows[:, 3], total, len(y) - len(rows), normal, parts)
 
 
 def right_digits(found: np.ndarray, certified: np.ndarray) -> float:

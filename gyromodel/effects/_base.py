@@ -185,6 +185,9 @@ def lacking(needed: Iterable[str], signals: Signals) -> list[str]:
 
     temperature_<place> stands for any second thermometer; several campaigns are a run each.
     """
+    needed = [each for each in needed if each not in signals]
+    if not needed:
+        return []
     groups = {SECOND_THERMOMETER: len(thermometers(signals)) > 1, ANY_ACCELERATION: bool(accelerations(signals))}
     groups["run"] = "run" in signals or "campaign" in signals
     return [each for each in needed if not any(groups.get(n, n in signals) for n in each.split(" or "))]

@@ -12,6 +12,7 @@ from gyromodel.estimate._fit import (
     whiten_columns,
 )
 from gyromodel.estimate._function import FunctionFit, fit_function
+from gyromodel.estimate._many import ManyFits, fit_many
 from gyromodel.estimate._noise import with_noise_intervals
 from gyromodel.estimate._two_stage import two_stage
 
@@ -20,10 +21,12 @@ __all__ = [
     "Estimate",
     "EstimateError",
     "FunctionFit",
+    "ManyFits",
     "check_covariates",
     "filter_of",
     "fit",
     "fit_function",
+    "fit_many",
     "fit_record",
     "given_ratios",
     "make_filter",

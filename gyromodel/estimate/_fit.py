@@ -96,10 +96,7 @@ def fit_record(
     check_covariates(record, model)
     check_units(model, record.output_unit, record.units)
     model = model.prepared(record.signals)
-    if record.present.sum() <= len(model.slots()) + 1:
-        raise EstimateError(
-            f"{int(record.present.sum())} samples cannot determine {len(model.slots())} parameters and their noise"
-        )
+    check_enough(record, len(model.slots()))
     given = given_ratios(record, model) if ratios is None else ratios
     white = NoiseRatios(jnp.zeros(()), jnp.zeros(()))
     ratios = given if given is not None else white
@@ -119,6 +116,13 @@ def fit_record(
         solution = solve(model, solution.x, record, filter_of(record, white), solver)
         estimate = _finish(record, model, ratios, filter, solution, variance=estimate.white_variance)
     return estimate
+
+
+def check_enough(record: Record, parameters: int) -> None:
+    """Refuse a record without samples to spare."""
+    samples = int(record.present.sum())
+    if samples <= parameters + 1:
+        raise EstimateError(f"{samples} samples cannot determine {parameters} parameters and their noise")
 
 
 def check_covariates(record: Record, model: GyroModel) -> None:
@@ -196,19 +200,7 @@ def _finish(
     variance: float | None = None,
 ) -> Estimate:
     """The estimate at a solution; `variance` is the white one where the solution is that of ordinary least squares."""
-    if not solution.converged:
-        raise EstimateError(
-            f"the fit of {', '.join(model.labels)} did not converge in {solution.iterations} iterations: "
-            "give start values near the solution, or fix some parameters"
-        )
-    model = model.with_vector(jnp.asarray(solution.x))
-    for effect in model.effects:
-        try:
-            replace(effect)
-        except ValueError as problem:
-            raise EstimateError(
-                f"the fit left what {effect.label} can be ({problem}): give start values nearer the solution"
-            ) from None
+    model = checked_solution(model, solution.x, solution.converged, solution.iterations)
     ordinary = variance is not None
     predicted, jacobian = model.linearise(record.signals)
     output, present = record.signals["output"], record.sampling.present
@@ -243,18 +235,35 @@ def _finish(
     )
 
 
+def checked_solution(model: GyroModel, x: np.ndarray, converged: bool, iterations: int) -> GyroModel:
+    """The model at a solution; refuses one that did not converge, or left what an effect can be."""
+    if not converged:
+        raise EstimateError(
+            f"the fit of {', '.join(model.labels)} did not converge in {iterations} iterations: "
+            "give start values near the solution, or fix some parameters"
+        )
+    model = model.with_vector(jnp.asarray(x))
+    for effect in model.effects:
+        try:
+            replace(effect)
+        except ValueError as problem:
+            raise EstimateError(
+                f"the fit left what {effect.label} can be ({problem}): give start values nearer the solution"
+            ) from None
+    return model
+
+
 def unit_covariance(whitened_jacobian: np.ndarray, model: GyroModel) -> np.ndarray:
     """(JᵀJ)⁻¹ from an R-only QR; refuses directions that the data do not determine, naming their effects."""
     p = whitened_jacobian.shape[1]
     if p == 0:
         return np.zeros((0, 0))
-    slots = model.slots()
     norm = np.linalg.norm(whitened_jacobian, axis=0)
     if not np.isfinite(norm).all():
-        lost = sorted({model.labels[slots[i].effect] for i in np.flatnonzero(~np.isfinite(norm))})
+        lost = _named(model, ~np.isfinite(norm))
         raise EstimateError(f"the fit ran away in {', '.join(lost)}: give start values, or fix some parameters")
     if (norm == 0).any():
-        silent = sorted({model.labels[slots[i].effect] for i in np.flatnonzero(norm == 0)})
+        silent = _named(model, norm == 0)
         raise EstimateError(
             f"{', '.join(silent)} cannot be estimated: this campaign does not excite it; remove it or fix it"
         )
@@ -262,13 +271,18 @@ def unit_covariance(whitened_jacobian: np.ndarray, model: GyroModel) -> np.ndarr
     _, singular, directions = np.linalg.svd(r)
     weak = directions[singular < SINGULAR * singular[0]]
     if len(weak):
-        involved = sorted({model.labels[slots[i].effect] for d in weak for i in np.flatnonzero(np.abs(d) > 0.1)})
-        names = " and ".join(involved)
+        names = " and ".join(_named(model, np.abs(weak).max(axis=0) > 0.1))
         raise EstimateError(
             f"{names} cannot be told apart on this campaign: fix all but one, or measure where they differ"
         )
     inverse = np.linalg.inv(r)
     return (inverse @ inverse.T) / np.outer(norm, norm)
+
+
+def _named(model: GyroModel, parameters: np.ndarray) -> list[str]:
+    """Labels of the effects that some of the free parameters belong to."""
+    slots = model.slots()
+    return sorted({model.labels[slots[i].effect] for i in np.flatnonzero(parameters)})
 
 
 def _ordinary_covariance(record: Record, filter: Filter, jacobian, model: GyroModel) -> np.ndarray:

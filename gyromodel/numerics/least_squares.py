@@ -64,9 +64,9 @@ def levenberg_marquardt(
             # Under heavy damping a small promise says nothing: then the residual must be orthogonal to every column, or
             # the last step, so short that it cost next to nothing, still led up, as where the cost has a kink.
             orthogonal = np.all(np.abs(g) <= 1e-6 * scale * np.sqrt(cost))
-            return Solution(
-                x, cost, iteration, bool(damping < 1.0 or orthogonal or worse <= KINK_TOLERANCE * tolerance * cost)
-            )
+            converged = bool(damping < 1.0 or orthogonal or worse <= KINK_TOLERANCE * tolerance * cost)
+            # The last step is as good as those before it, and known already.
+            return Solution(x + step if converged else x, cost, iteration, converged)
         a_new, g_new, cost_new = normal(x + step)
         if _finite(a_new, g_new, cost_new) and cost_new <= cost:
             decrease = cost - cost_new

@@ -1,0 +1,181 @@
+"""The normal equations of one campaign inside a compiled program, gathered block by block.
+
+Rows are parameters and run along the samples, so that they are whole vectors for the processor; a block of them stays
+in cache, the Jacobian as a whole is never stored, and what is padded behind the last sample costs nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from gyromodel.effects import Effect, Signals
+from gyromodel.model import GyroModel
+from gyromodel.numerics.state_space import Filter, at_rest, whiten_on
+
+BLOCK = 512
+
+# Of one effect: a row for each linear coefficient, and one for each nonlinear parameter; None where there is none free.
+Rows = tuple[Float[Array, "*block coefficient sample"], Float[Array, "*block shape sample"] | None]
+
+
+class Blocks(NamedTuple):
+    """A campaign's samples in blocks, or many campaigns' with one axis more.
+
+    Of signals and `weight` the axes are block and sample. `weight` is one over the white noise relative to its unit,
+    zero where there is no sample; `used` counts the blocks that hold samples; with `filter` the noise is coloured.
+    """
+
+    signals: Mapping[str, Any]
+    weight: Any
+    used: Any
+    filter: Filter | None
+
+
+Known = Mapping[int, Rows]
+Vector = Float[Array, " parameter"]
+
+
+def gram_and_roughness(
+    model: GyroModel, data: Blocks
+) -> tuple[Callable[[Vector], Float[Array, "column column"]], Callable[[Vector], Float[Array, ""]]]:
+    """Two functions of the free parameters; rows that no nonlinear parameter shapes are computed once for both.
+
+    Returns:
+        [J, r]ᵀ[J, r] of the whitened residual r; and half the mean square of the successive differences of the weighted
+        residual, which is the variance of its white part.
+    """
+    free = _free(model)
+
+    def rows_of(effect: Effect, names: tuple[str, ...]) -> Rows:
+        if effect.remembers:  # it looks at neighbouring samples, and must see all of them
+            whole = {name: values.ravel() for name, values in data.signals.items()}
+            return jax.tree.map(_in_blocks, _rows(effect, whole, names))
+        return _over_blocks(lambda part: _rows(effect, part, names), data)
+
+    steady = {
+        i: rows_of(effect, ())
+        for i, effect in enumerate(model.effects)
+        if effect.site != "gain" and not _shaped(effect, free.get(i, ()))
+    }
+
+    def at(x: Vector) -> tuple[GyroModel, Known]:
+        """The model and its rows, before they are multiplied by what they act on.
+
+        In a loop of their own: the compiler would compute an exponential again for each row that contains it.
+        """
+        now = model.with_vector(x)
+        others = {i: rows_of(e, free[i]) for i, e in enumerate(now.effects) if e.site != "gain" and i not in steady}
+        return now, steady | others
+
+    def gram(x: Vector) -> Float[Array, "column column"]:
+        now, known = at(x)
+
+        def add(block, carry):
+            state, total = carry
+            part = jax.tree.map(lambda values: values[block], (data.signals, data.weight, known, data.filter))
+            signals, weight, rows, filter = part
+            stacked = _stacked(now, signals, rows, free)
+            if filter is None:
+                stacked = jnp.where(weight > 0, stacked * weight, 0.0)
+            else:
+                state, white = whiten_on(state, filter, stacked.T)
+                stacked = white.T
+            return state, total + stacked @ stacked.T
+
+        width = x.shape[0] + 1
+        state = jnp.zeros(0)
+        if data.filter is not None:
+            state = at_rest(jax.tree.map(lambda values: values[0], data.filter), width)
+        return jax.lax.fori_loop(0, data.used, add, (state, jnp.zeros((width, width))))[1]
+
+    def roughness(x: Vector) -> Float[Array, ""]:
+        now, known = at(x)
+
+        def add(block, carry):
+            signals, weight, rows = jax.tree.map(lambda values: values[block], (data.signals, data.weight, known))
+            change = jnp.diff(weight * jnp.where(weight > 0, _stacked(now, signals, rows, free)[-1], 0.0))
+            both = (weight[1:] > 0) & (weight[:-1] > 0)
+            return carry[0] + jnp.sum(jnp.where(both, change, 0.0) ** 2), carry[1] + both.sum()
+
+        squares, pairs = jax.lax.fori_loop(0, data.used, add, (jnp.zeros(()), jnp.zeros((), int)))
+        return squares / 2.0 / jnp.maximum(pairs, 1)
+
+    return gram, roughness
+
+
+def _over_blocks(rows: Callable[[Signals], Rows], data: Blocks) -> Rows:
+    """Rows of every block that holds samples, zeros elsewhere."""
+    shapes = jax.eval_shape(rows, {name: values[0] for name, values in data.signals.items()})
+    blocks = data.weight.shape[0]
+
+    def put(block, found):
+        part = rows({name: values[block] for name, values in data.signals.items()})
+        return jax.tree.map(lambda all, one: all.at[block].set(one), found, part)
+
+    return jax.lax.fori_loop(0, data.used, put, jax.tree.map(lambda s: jnp.zeros((blocks, *s.shape), s.dtype), shapes))
+
+
+def _in_blocks(rows: Float[Array, "row sample"]) -> Float[Array, "block row part"]:
+    """Rows cut into blocks."""
+    return rows.reshape(len(rows), -1, BLOCK).swapaxes(0, 1)
+
+
+def _free(model: GyroModel) -> dict[int, tuple[str, ...]]:
+    """Free fields by the place of their effect."""
+    fields: dict[int, tuple[str, ...]] = {}
+    for slot in model.slots():
+        names = fields.get(slot.effect, ())
+        fields[slot.effect] = names if slot.field in names else (*names, slot.field)
+    return fields
+
+
+def _shaped(effect: Effect, free: tuple[str, ...]) -> bool:
+    return any(not effect.declared()[name].linear for name in free)
+
+
+def _rows(effect: Effect, signals: Signals, free: tuple[str, ...]) -> Rows:
+    """What is fixed of the shapes is left out before rows are made of them: its derivatives are not computed then."""
+    if not _shaped(effect, free):
+        return effect.columns(signals).T, None
+    places, start = [], 0
+    for name in (k for k, declared in effect.declared().items() if not declared.linear):
+        size = np.size(getattr(effect, name))
+        places += range(start, start + size) if name in free else ()
+        start += size
+    derivatives = effect.shape_derivatives(signals)
+    return effect.columns(signals).T, jnp.stack([derivatives[:, k] for k in places])
+
+
+def _stacked(
+    model: GyroModel, signals: Signals, known: Mapping[int, Rows], free: Mapping[int, tuple[str, ...]]
+) -> Float[Array, "row sample"]:
+    """The derivative of the output by each free parameter, and last predicted minus measured output."""
+    rate = signals.get("rate", jnp.zeros_like(signals["time"]))
+    scale = jnp.ones_like(rate)
+    for i, effect in enumerate(model.effects):
+        if effect.site == "gain":
+            continue
+        term = effect.linear() @ known[i][0]
+        rate, scale = (rate + term, scale) if effect.site == "rate" else (rate, scale + term)
+    gain = model.gain()
+    prediction = gain * rate * scale
+    stacked = []
+    for i, names in free.items():
+        effect = model.effects[i]
+        if effect.site == "gain":
+            stacked.append((prediction / effect.value)[None])  # type: ignore[attr-defined]
+            continue
+        by = gain * scale if effect.site == "rate" else gain * rate
+        for name in names:
+            linear = effect.declared()[name].linear
+            alike = [k for k, d in effect.declared().items() if d.linear == linear and (linear or k in names)]
+            start = sum(np.size(getattr(effect, k)) for k in alike[: alike.index(name)])
+            part = known[i][0 if linear else 1]
+            stacked.append(by * part[start : start + np.size(getattr(effect, name))])  # type: ignore[index]
+    return jnp.concatenate([*stacked, (prediction - signals["output"])[None]])

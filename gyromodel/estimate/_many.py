@@ -1,0 +1,294 @@
+"""One model fitted to each of many campaigns by one compiled program, several threads calling it."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import threading
+from collections import deque
+from collections.abc import Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from copy import copy
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from gyromodel.effects import Effect, Signals
+from gyromodel.estimate._estimate import EstimateError
+from gyromodel.estimate._fit import SINGULAR, check_covariates, checked_solution, unit_covariance
+from gyromodel.estimate._together import TOGETHER, Waiting, kind_of, ready, searches, side_by_side
+from gyromodel.model import GyroModel, Slot
+from gyromodel.numerics.compiled_least_squares import Search
+from gyromodel.signals import Record
+from gyromodel.units import factor, internal_unit
+
+MOST_ITERATIONS = 100
+# Standard deviations by which chi-squared may lie above its degrees of freedom before other starts are tried.
+BAD_FIT = 5.0
+# Starts looked at where a fit is bad, and how many of the best are followed to their minimum.
+STARTS, FOLLOWED = 64, 4
+# Starts of a nonlinear parameter without a grid of its own: the given one and so many of its typical sizes around it.
+AROUND = (0.0, -4.0, -1.0, -0.25, 0.25, 1.0, 4.0)
+
+
+@dataclass(frozen=True)
+class ManyFits:
+    """Fits of one model structure to many campaigns, in their order; a fit that failed is NaN and has its reason.
+
+    Attributes:
+        prepared: each campaign's model before the fit, what depends on the campaign filled in; `model` has the fit.
+        values: of the free parameters in the order of `slots()`, internal units.
+        covariance: of these.
+        white_variance: variance of the white noise of one sample, output unit squared.
+        reduced_chi_squared: `white_variance` over the stated one; where none is stated over half the mean square of the
+            residual's successive differences, which a wrong minimum leaves small.
+        iterations: points that the last search of a campaign looked at.
+        converged: whether there is an estimate.
+        restarted: whether other starts of the nonlinear parameters were tried.
+        reasons: why a fit failed, one sentence; empty where it did not.
+    """
+
+    prepared: Sequence[GyroModel] = field(repr=False)
+    values: Float[np.ndarray, "campaign parameter"]
+    covariance: Float[np.ndarray, "campaign parameter parameter"] = field(repr=False)
+    white_variance: Float[np.ndarray, " campaign"]
+    reduced_chi_squared: Float[np.ndarray, " campaign"]
+    iterations: Int[np.ndarray, " campaign"]
+    converged: Bool[np.ndarray, " campaign"]
+    restarted: Bool[np.ndarray, " campaign"]
+    reasons: Sequence[str]
+
+    @property
+    def std(self) -> Float[np.ndarray, "campaign parameter"]:
+        """Standard uncertainties, internal units."""
+        return np.sqrt(np.einsum("cpp->cp", self.covariance))
+
+    def model(self, campaign: int) -> GyroModel:
+        """A campaign's model at its estimate, its noise as it was given."""
+        return self.prepared[campaign].with_vector(self.values[campaign])
+
+
+class _Fitted(NamedTuple):
+    x: np.ndarray
+    covariance: np.ndarray
+    white: float
+    chi: float
+    iterations: int
+    restarted: bool
+    reason: str
+    lost: bool = False  # no minimum was found, or one that cannot be
+
+
+def fit_many(
+    records: Iterable[Record],
+    model: GyroModel,
+    *,
+    restarts: bool = True,
+    threads: int | None = None,
+) -> ManyFits:
+    """Fit the free parameters of a model to each of many campaigns.
+
+    Values are those of `fit_record` with the noise that the model states or, where it states none, with white noise of
+    unknown size; noise is not identified here. One program is compiled for a model's structure and each power of two of
+    the campaigns' lengths. Only the campaigns being fitted are held in memory, so that `records` may be a generator.
+
+    Args:
+        records: the campaigns' data.
+        model: what to fit; where it states its reference points, parameters of different campaigns compare.
+        restarts: try other starts of the nonlinear parameters where a fit is bad or found no minimum.
+        threads: how many call the compiled program at once; by default one for each processor.
+
+    Raises:
+        EstimateError: JAX runs in single precision. A campaign that cannot be fitted is told of in the result.
+    """
+    if not jnp.zeros(()).dtype == jnp.float64:
+        raise EstimateError("JAX runs in single precision; import gyromodel before using jax, or set JAX_ENABLE_X64=1")
+    threads = threads or _processors()
+    prepared: list[GyroModel] = []
+    given = np.asarray(model.vector())
+    done: dict[int, _Fitted] = {}
+    waiting: dict[Any, list[Waiting]] = {}
+    compiled: dict[Any, threading.Event] = {}
+    running: deque[Future[dict[int, _Fitted]]] = deque()
+
+    def work(key: Any, campaigns: list[Waiting], first: bool) -> dict[int, _Fitted]:
+        # The first of a kind compiles; the others wait for its program instead of compiling it too.
+        if not first:
+            compiled[key].wait()
+        try:
+            return _fit_together(campaigns, key[0], restarts)
+        finally:
+            compiled[key].set()
+
+    with ThreadPoolExecutor(threads) as pool:
+
+        def start(key: Any) -> None:
+            first = key not in compiled
+            compiled.setdefault(key, threading.Event())
+            running.append(pool.submit(work, key, waiting.pop(key), first))
+            while len(running) > 2 * threads:
+                done.update(running.popleft().result())
+
+        for place, record in enumerate(records):
+            prepared.append(model)
+            try:
+                campaign = ready(place, record, model, given)
+            except ValueError as problem:
+                done[place] = _failed(str(problem))
+                continue
+            prepared[place] = campaign.model
+            key = kind_of(campaign)
+            waiting.setdefault(key, []).append(campaign)
+            if len(waiting[key]) == TOGETHER:
+                start(key)
+        for key in list(waiting):
+            start(key)
+        for future in running:
+            done.update(future.result())
+    return _gathered(prepared, [done[i] for i in range(len(prepared))])
+
+
+def _processors() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _fit_together(campaigns: list[Waiting], blocks: int, restarts: bool) -> dict[int, _Fitted]:
+    data, slots = side_by_side(campaigns, blocks), campaigns[0].model.slots()
+    first = searches(data, [(i, c.start) for i, c in enumerate(campaigns)], MOST_ITERATIONS)
+    fitted = [_finish(c, slots, *found) for c, found in zip(campaigns, first, strict=True)]
+    limit = 1.0 + BAD_FIT * np.sqrt(2.0 / data.freedom)
+    bad = [i for i, fit in enumerate(fitted) if restarts and (fit.lost or fit.chi > limit[i])]
+    tried = [(i, x) for i in bad for x in _starts(campaigns[i].model, campaigns[i].record.signals)]
+    looked = [found.cost - found.promise for found, _ in searches(data, tried, 1)]
+    followed = []
+    for i in {i for i, _ in tried}:
+        own = [(cost, k) for k, cost in enumerate(looked) if tried[k][0] == i and np.isfinite(cost)]
+        followed += [tried[k] for _, k in sorted(own)[:FOLLOWED]]
+    for (i, _), found in zip(followed, searches(data, followed, MOST_ITERATIONS), strict=True):
+        other = _finish(campaigns[i], slots, *found)
+        better = not other.reason and (fitted[i].reason or other.white < fitted[i].white)
+        fitted[i] = (other if better else fitted[i])._replace(restarted=True)
+    return {c.place: fit for c, fit in zip(campaigns, fitted, strict=True)}
+
+
+def _failed(reason: str) -> _Fitted:
+    return _Fitted(np.zeros(0), np.zeros((0, 0)), np.nan, np.nan, 0, False, reason)
+
+
+def _finish(campaign: Waiting, slots: Sequence[Slot], found: Search, expected: float) -> _Fitted:
+    """The estimate where a search ended, or why there is none."""
+    record, model, x, iterations = campaign.record, campaign.model, np.asarray(found.x), int(found.iterations)
+    white = float(found.cost - found.promise) / float(record.present.sum() - len(x))
+    chi = white / float(expected) if np.isfinite(white) else np.nan
+    lost = False
+    try:
+        if not np.isfinite(found.cost):
+            check_covariates(record, model)
+            raise EstimateError("the model is not finite at its start values: give others")
+        lost = not found.converged or not _possible(model, slots, x)
+        if lost:
+            checked_solution(model, x, bool(found.converged), iterations)
+        covariance = _inverse(np.asarray(found.information), model) * white
+    except ValueError as problem:
+        return _failed(str(problem))._replace(chi=chi, iterations=iterations, lost=lost)
+    return _Fitted(x, covariance, white, chi, iterations, False, "")
+
+
+def _inverse(information: np.ndarray, model: GyroModel) -> np.ndarray:
+    """(JᵀJ)⁻¹; refuses directions that the data do not determine, as far as JᵀJ can tell in its rounding."""
+    size = np.sqrt(np.diag(information))
+    size[size == 0] = 1.0
+    values, vectors = np.linalg.eigh(information / np.outer(size, size))
+    lost = max(SINGULAR**2, len(size) * np.finfo(float).eps) * values.max(initial=0.0)
+    if (values <= lost).any():
+        # A root of JᵀJ stands for J, and what names the effects is the same.
+        unit_covariance(np.sqrt(np.where(values > lost, values, 0.0))[:, None] * vectors.T * size, model)
+    vectors = vectors / size[:, None]
+    return (vectors / values) @ vectors.T
+
+
+def _possible(model: GyroModel, slots: Sequence[Slot], x: np.ndarray) -> bool:
+    """Whether no nonlinear parameter has left what its effect can be."""
+    changed: dict[int, Effect] = {}
+    for slot, value in zip(slots, x, strict=True):
+        if not slot.linear:
+            effect = changed.setdefault(slot.effect, copy(model.effects[slot.effect]))
+            values = np.array(getattr(effect, slot.field))
+            values.flat[slot.index] = value
+            # A new effect with arrays of JAX would take longer than its part of the fit.
+            vars(effect)[slot.field] = values
+    try:
+        for effect in changed.values():
+            for kind in type(effect).__mro__:
+                if "__check_init__" in vars(kind):
+                    kind.__check_init__(effect)  # type: ignore[attr-defined]
+    except ValueError:
+        return False
+    return True
+
+
+def _starts(model: GyroModel, signals: Signals) -> list[np.ndarray]:
+    """Starts at other values of the free nonlinear parameters: all combinations of their levels, or a draw of them."""
+    start, slots = np.asarray(model.vector()), model.slots()
+    levels: list[list[tuple[list[int], np.ndarray]]] = []
+    for i, effect in enumerate(model.effects):
+        own = [k for k, slot in enumerate(slots) if slot.effect == i and not slot.linear]
+        if not own:
+            continue
+        forms = [
+            np.array([np.ravel(getattr(e, slots[k].field))[slots[k].index] for k in own])
+            for e in _alike(effect, signals)
+        ]
+        if forms:
+            levels.append([(own, values) for values in forms])
+            continue
+        for k in own:
+            declared = effect.declared()[slots[k].field]
+            size = declared.typical * factor(declared.unit, internal_unit(declared.unit))
+            levels.append([([k], start[[k]] + size * times) for times in AROUND])
+    if not levels:
+        return []
+    if np.prod([float(len(each)) for each in levels]) <= STARTS:
+        chosen: Iterable[Sequence[tuple[list[int], np.ndarray]]] = itertools.product(*levels)
+    else:
+        rng = np.random.default_rng(0)
+        chosen = [[each[rng.integers(len(each))] for each in levels] for _ in range(STARTS)]
+    found = []
+    for combination in chosen:
+        x = start.copy()
+        for places, values in combination:
+            x[places] = values
+        found.append(x)
+    return found
+
+
+def _alike(effect: Effect, signals: Signals) -> list[Effect]:
+    """The forms that a search would try, of the same shapes."""
+    shapes = {name: np.shape(getattr(effect, name)) for name in effect.declared()}
+    forms = effect.candidates(signals)
+    return [e for e in forms if all(np.shape(getattr(e, name)) == shape for name, shape in shapes.items())]
+
+
+def _gathered(prepared: list[GyroModel], fits: list[_Fitted]) -> ManyFits:
+    """Results as arrays; campaigns without an estimate, or of another number of parameters, are NaN."""
+    p = next((len(fit.x) for fit in fits if not fit.reason), 0)
+    odd = f"the model has another number of free parameters here than the {p} of the first campaign"
+    fits = [fit if fit.reason or len(fit.x) == p else _failed(odd) for fit in fits]
+    good = np.array([not fit.reason for fit in fits], bool)
+    values, covariance = np.full((len(fits), p), np.nan), np.full((len(fits), p, p), np.nan)
+    for i in np.flatnonzero(good):
+        values[i], covariance[i] = fits[i].x, fits[i].covariance
+    return ManyFits(
+        prepared=prepared,
+        values=values,
+        covariance=covariance,
+        white_variance=np.array([fit.white for fit in fits]),
+        reduced_chi_squared=np.array([fit.chi for fit in fits]),
+        iterations=np.array([fit.iterations for fit in fits], int),
+        converged=good,
+        restarted=np.array([fit.restarted for fit in fits], bool),
+        reasons=[fit.reason for fit in fits],
+    )
