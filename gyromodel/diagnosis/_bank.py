@@ -92,6 +92,8 @@ def build_bank(record: Record) -> Bank:
     scans = []
     rate = np.asarray(signals.get("rate", jnp.zeros_like(signals["time"])))
     for name, kind in sorted(CATALOGUE.items()):
+        if kind.domain != record.domain:
+            continue
         if name == "bias_column" or (kind.site == "gain" and "rate" not in signals):
             if name != "bias_column":
                 not_testable[name] = "needs a column rate"
@@ -110,13 +112,15 @@ def build_bank(record: Record) -> Bank:
             elif part := kind.hidden(signals):
                 not_testable[PART_OF + name] = part
             blocks.extend((name, "effect", _weighted(e, signals, rate), e) for e in forms)
+    # A column of a platform's test is part of its motion, in proportion to which the angle errs by other names.
+    linear = record.domain == "gyro"
     for name in record.signals:
         reason = "" if is_no_driver(name) else unusable(record, name)
         if reason:
             not_testable |= {f"smooth({name})": reason} | (
-                {} if _is_owned(record, name) else {BiasColumn(column=name).label: reason}
+                {} if not linear or _is_owned(record, name) else {BiasColumn(column=name).label: reason}
             )
-    for name in [n for n in driver_names(record) if not _is_owned(record, n)]:
+    for name in [n for n in driver_names(record) if linear and not _is_owned(record, n)]:
         effect = BiasColumn(column=name).prepared(record.signals)
         blocks.append((effect.label, "effect", _weighted(effect, record.signals, rate), effect))
     along = {}

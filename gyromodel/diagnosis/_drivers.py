@@ -27,7 +27,7 @@ NOT_DRIVERS = ("time", "output", "segment", "run", "position", "feedback_ramp", 
 
 def is_no_driver(name: str) -> bool:
     """Whether a signal is bookkeeping, the output, or derived from others."""
-    return name in NOT_DRIVERS or bool(DERIVED.fullmatch(name))
+    return name in NOT_DRIVERS or name.startswith("_") or bool(DERIVED.fullmatch(name))
 
 
 def unusable(record: Record, name: str) -> str:

@@ -84,7 +84,7 @@ def form_effect(scanner: Scanner, name: str, form: int) -> Effect | None:
 def _solved(scanner: Scanner, estimate: Estimate, effect: Effect, g: int, pulses: tuple[int, ...]) -> Effect:
     """The effect at the coefficients that fit best beside the baseline, in one noise cell."""
     model = estimate.model
-    model = GyroModel(tuple(e for e in model.effects if e.label not in effect.supersedes), {}, model.fixed, model.gyro)
+    model = replace(model, effects=tuple(e for e in model.effects if e.label not in effect.supersedes), noise={})
     if effect.site == "gain":
         return effect
     columns = model.columns_of(effect, scanner.record.signals)

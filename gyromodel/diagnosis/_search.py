@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -208,7 +208,7 @@ def refit(record: Record, baseline: Estimate, found: list[Found], noise: NoisePa
             model = model.with_effect(step.effect)
     rows = [r for f in found for r in f.rows]
     data = record.without(np.array(rows)) if rows else record
-    model = GyroModel(model.effects, baseline.model.noise if given else {}, model.fixed, model.gyro)
+    model = replace(model, noise=baseline.model.noise if given else {})
     freed = [f.name for f in found if f.frees_noise]
     for attempt in (model, _shapes_held(model, found)):
         try:
@@ -237,7 +237,7 @@ def _shapes_held(model: GyroModel, found: list[Found]) -> GyroModel:
 
 def replace_fixed(model: GyroModel, fixed: frozenset[tuple[str, str]]) -> GyroModel:
     """The model with another set of fixed parameters."""
-    return GyroModel(model.effects, model.noise, fixed, model.gyro)
+    return replace(model, fixed=fixed)
 
 
 def uncontested(step: Found) -> bool:

@@ -228,7 +228,7 @@ def _finish(
     whitened = np.full(rows, np.nan)
     whitened[record.present] = w[:, p] / np.sqrt(white)
     return Estimate(
-        model=GyroModel(model.effects, noise, model.fixed, model.gyro),
+        model=replace(model, noise=noise, noise_of=record.domain),
         covariance=covariance * white,
         degrees_of_freedom=nu,
         residual=np.where(record.present, np.asarray(residual)[:rows], np.nan),

@@ -21,9 +21,12 @@ def export_calibration(calibration: Calibration, to: Form) -> str:
             it takes to compute the model elsewhere; "csv", one row a number.
 
     Raises:
-        ModelError: an effect does not say which columns it reads; to C, one that looks at other samples, or computes
+        ModelError: the model is of a platform, or an effect does not say which columns it reads; to C, one that looks at
+            other samples, or computes
             what a few C statements cannot.
     """
+    if calibration.model.domain == "platform":
+        raise ModelError("a model of a platform's base corrects no gyro: only models of gyros are exported")
     for effect in calibration.model.effects:
         if unnamed := [name for name in effect.columns_needed if "<" in name]:
             raise ModelError(

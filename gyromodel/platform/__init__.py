@@ -27,6 +27,7 @@ from gyromodel.platform._increments import coning, integrals, sculling
 from gyromodel.platform._loop import Loop, Margins, Mount, margins, measured_response
 from gyromodel.platform._motion import GIMBALS, TABLE, BaseMotion, base_motion, is_platform
 from gyromodel.platform._navigation import Navigation, attitudes, navigate
+from gyromodel.platform._record import VibrationTest, fit_vibration, vibration_test
 from gyromodel.platform._sensitivity import attitude_sensitivity
 from gyromodel.platform._simulation import Axis, simulate_axis
 from gyromodel.platform._vibration import PublishedResponse, SineFit, fit_sines, published_response
@@ -55,6 +56,7 @@ __all__ = [
     "Points",
     "PublishedResponse",
     "SineFit",
+    "VibrationTest",
     "attitude_sensitivity",
     "attitudes",
     "base_angles",
@@ -65,6 +67,7 @@ __all__ = [
     "euler_attitude",
     "explain",
     "fit_sines",
+    "fit_vibration",
     "gimbal_attitude",
     "gravity",
     "integrals",
@@ -86,4 +89,5 @@ __all__ = [
     "separation",
     "simulate_axis",
     "transport_rate",
+    "vibration_test",
 ]

@@ -1,0 +1,89 @@
+"""A common vibration test of the simulated platform, and each kind of discrepancy hidden in it at a given size.
+
+Oscillations of each axis by itself from 2 to 30 rad/s at two amplitudes, and slow ones of tens of degrees, as an
+acceptance programme has them. Without anything hidden the shafts have no friction: the gimbals then show all that the
+base does.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from gyromodel.campaign import Campaign
+from tests.truth import platform
+from tests.truth.platform import Loop, Platform, Run
+from tests.truth.platform_campaign import GIMBALS, PAUSE
+
+FREQUENCIES, SMALL, LARGE, SLOW = (2.0, 8.0, 15.0, 30.0), np.deg2rad([0.5, 0.1]), np.deg2rad(40.0), 1.0
+LENGTH, SKIPPED = 7.0, 1.0
+# Standard deviation of an encoder's reading and root of the density of the gyros' white noise (rad, rad/s/√Hz).
+NOISE, WALK = np.deg2rad(1.0 / 3600), np.deg2rad(1e-4) / 60
+FREE = Platform(viscous=np.zeros(4), coulomb=np.zeros(4), step=1e-3, noise=WALK)
+# Friction that a simulation knows.
+RUBBING = FREE._replace(viscous=np.full(4, 0.3), coulomb=np.full(4, 0.03))
+
+
+def common() -> tuple[np.ndarray, np.ndarray]:
+    """Amplitudes (run by axis, rad) and frequencies (rad/s)."""
+    small = [SMALL[0] * np.eye(3)] * len(FREQUENCIES) + [SMALL[1] * np.eye(3)]
+    amplitude = np.concatenate([*small, LARGE * np.eye(3)])
+    return amplitude, np.repeat([*FREQUENCIES, FREQUENCIES[1], SLOW], 3)[:, None] * np.ones(3)
+
+
+def narrow() -> tuple[np.ndarray, np.ndarray]:
+    """One axis at one frequency and amplitude, four times."""
+    return np.tile(SMALL[0] * np.eye(3)[:1], (4, 1)), np.full((4, 3), FREQUENCIES[1])
+
+
+TESTS = {"common": common, "narrow": narrow}
+
+
+def hidden(effect: str, size: float) -> Platform:
+    """The platform with one effect at a size in its own unit."""
+    change: dict[str, Any] = {
+        "": lambda: {},
+        # s
+        "sync_delay": lambda: {"offset": -size},
+        # rad/s
+        "loop_resonance": lambda: {"isolator": (size, 0.1)},
+        # N m s/rad, and a tenth of it in N m
+        "shaft_friction": lambda: {"viscous": np.full(4, size), "coulomb": np.full(4, 0.1 * size)},
+        # rad
+        "gimbal_nonorthogonality": lambda: {"tilts": size * np.array([[0, 0, 0], [0, 0, 0], [0, 0, 0], [1.0, 0, 0]])},
+        # rad
+        "encoder_harmonic": lambda: {"harmonics": size * np.array([[[0, 0]], [[0.6, 0.8]], [[0, 0]], [[0, 0.0]]])},
+        # rad/s
+        "platform_drift": lambda: {"drift": lambda time: np.full((len(time), 3), size * np.array([0.8, 0.0, 0.6]))},
+    }[effect]()
+    return FREE._replace(**change)
+
+
+def other_loop(size: float) -> Platform:
+    """Known friction in a loop whose crossover is larger by a part."""
+    return RUBBING._replace(loop=Loop(crossover=Loop().crossover * (1.0 + size)))
+
+
+@cache
+def _simulated(test: str, key: tuple[str, float]) -> Run:
+    amplitude, frequency = TESTS[test]()
+    name, size = key
+    design = other_loop(size) if name == "loop_dynamics" else hidden(name, size)
+    return platform.simulate(design, amplitude, frequency, LENGTH)
+
+
+def vibration(effect: str = "", size: float = 0.0, seed: int = 0, test: str = "common", more: Platform | None = None) -> Campaign:
+    """The log of a test with an effect hidden; the mechanics are simulated once, the encoders' noise is drawn anew."""
+    run = _simulated(test, (effect, size)) if more is None else platform.simulate(more, *TESTS[test](), LENGTH)
+    kept, rng, parts = run.time >= SKIPPED, np.random.default_rng(seed), []
+    for k, (table, gimbals) in enumerate(zip(run.table, run.gimbals, strict=True)):
+        readings = np.concatenate([table, gimbals], axis=1)[kept]
+        readings = readings + NOISE * rng.standard_normal(readings.shape)
+        time = run.time[kept] - SKIPPED + k * (LENGTH - SKIPPED + PAUSE)
+        parts.append(np.column_stack([time, np.full(kept.sum(), k + 1.0), np.rad2deg(readings)]))
+    names = ["time", "segment", "table_x", "table_y", "table_z", *GIMBALS]
+    units = dict(zip(names, ["s", "", *["deg"] * 7], strict=True))
+    columns = dict(zip(names, np.concatenate(parts).T, strict=True))
+    return Campaign(columns, units, {"latitude_deg": float(np.rad2deg(platform.Platform().latitude))}, "vibration")
