@@ -46,6 +46,8 @@ def addition(
         frequency = np.append(line_frequencies(estimate.model), _lines(scanner, ranking, estimate.model))
         none = jnp.zeros(len(frequency))
         effect = BiasPeriodic(cosine=none, sine=none, frequency=jnp.asarray(frequency))
+    for held in estimate.model.effects:
+        effect = effect.joined(held) if held.label == effect.label and effect.label in effect.supersedes else effect
     return _solved(scanner, estimate, effect, ranking.best_cell(name), pulses).settled(), ()
 
 

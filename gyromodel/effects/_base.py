@@ -144,6 +144,10 @@ class Effect(eqx.Module):
         """Fields that are neither parameters nor the column and unit of a driver."""
         return tuple(f.name for f in fields(cls) if f.name not in (*cls.declared(), "column", "unit"))
 
+    def joined(self, held: Effect) -> Self:
+        """What a model that holds the same effect in another form has of both; of this one the coefficients are zero."""
+        return self
+
     def settled(self) -> Self:
         """The form to fit once the search has chosen this one; fields in `held` are left as they are here."""
         return self

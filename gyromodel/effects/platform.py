@@ -29,8 +29,8 @@ TILTS = tuple(
 )
 # Phases (rad) that a delay makes at the highest frequency, the least by a share; as parts of the lowest and times the
 # highest frequency, where modes are searched; their damping; corners of loops (rad/s).
-PHASES = np.concatenate([np.geomspace(0.02, 0.3, 4), np.arange(0.6, 10.0, 0.3)])
-LOWEST_MODE, HIGHEST_MODE, MODES, DAMPING = 0.5, 30.0, 40, (0.03, 0.1, 0.3, 0.8)
+PHASES = np.concatenate([[0.03, 0.2], np.arange(0.5, 6.6, 0.3)])
+LOWEST_MODE, HIGHEST_MODE, MODES, DAMPING = 0.5, 10.0, 25, (0.05, 0.2, 0.7)
 CORNERS = (3.0, 10.0, 30.0, 60.0, 120.0)
 # Columns that keep less than this part of their length beside others cannot be seen beside them.
 SEEN = 0.02
@@ -285,6 +285,11 @@ class GimbalNonorthogonality(_OfPlatform):
         if np.shape(self.tilt) != (len(self.tilts),):
             raise ValueError("tilt takes one angle for each of the tilts")
 
+    def joined(self, held: Effect) -> Self:
+        """The tilts of both."""
+        tilts = tuple(n for n in TILTS if n in (*self.tilts, *held.tilts))  # type: ignore[attr-defined]
+        return type(self)(jnp.zeros(len(tilts)), tilts)
+
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """−∂θ/∂τ of each."""
         return stack(*(signals[f"_{name}"] for name in self.tilts))
@@ -327,6 +332,11 @@ class EncoderHarmonic(_OfPlatform):
             raise ValueError(f"{min(unknown)} is no term: these are {', '.join(known)}")
         if not np.shape(self.cosine) == np.shape(self.sine) == (len(self.terms),):
             raise ValueError("cosine and sine take one angle for each of the terms")
+
+    def joined(self, held: Effect) -> Self:
+        """The terms of both."""
+        terms = tuple(dict.fromkeys((*held.terms, *self.terms)))  # type: ignore[attr-defined]
+        return type(self)(jnp.zeros(len(terms)), jnp.zeros(len(terms)), terms)
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """∂θ/∂β cos kβ of each term, then ∂θ/∂β sin kβ."""

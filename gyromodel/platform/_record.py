@@ -31,7 +31,7 @@ FEWEST = 24
 # Variance of a stretch's own constant, over that of white noise.
 UNKNOWN = 1e6
 # A sine is one whose energy is so many times the noise's, and what else moves may be this part of it.
-SEEN, UNLIKE = 25.0, 0.05
+SEEN, UNLIKE = 50.0, 0.05
 # Time between two stretches of the record in reports, s.
 PAUSE = 1.0
 
@@ -118,7 +118,7 @@ class _Run(NamedTuple):
     gimbals: np.ndarray
     changes: np.ndarray
     waves: list[tuple[np.ndarray, float]]
-    shafts: list[tuple[np.ndarray, float]]
+    turns: list[tuple[np.ndarray, float]]
 
 
 def _run(motion: BaseMotion, rows: np.ndarray, changes: np.ndarray) -> _Run | str:
@@ -133,13 +133,13 @@ def _run(motion: BaseMotion, rows: np.ndarray, changes: np.ndarray) -> _Run | st
         if left > UNLIKE:
             return f"the motion of table_{axis} is no oscillation of one frequency"
         waves.append((wave, frequency))
-    shafts = [_sine(time, gimbals[:, GIMBALS.index(shaft)])[:2] for shaft in SHAFTS]
+    turns = [_sine(time, angle)[:2] for angle in gimbals.T]
     output = motion.base[rows] - table
     # Where the platform began is known to a reading: it is turned so that mean angles agree.
     turn = _aligning(changes, output[..., None])
     output = output - (changes[..., :3] @ turn)[..., 0]
     changes = np.concatenate([changes, _drifting(changes, time)], axis=2)
-    return _Run(time, table, output, gimbals, changes, waves, shafts)
+    return _Run(time, table, output, gimbals, changes, waves, turns)
 
 
 def _aligning(changes: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -158,7 +158,7 @@ def _rows(run: _Run, phase: float = PHASE) -> int:
 def _together(run: _Run, phase: float) -> int:
     """Samples in a mean."""
     step = float(run.time[-1]) / (len(run.time) - 1)
-    fastest = max(w for _, w in (*run.waves, *run.shafts))
+    fastest = max(w for _, w in (*run.waves, *run.turns))
     return int(max(1, min(phase / (fastest * step) if fastest else np.inf, len(run.time) // FEWEST)))
 
 
@@ -182,14 +182,19 @@ def _stretches(run: _Run, phase: float) -> list[dict[str, np.ndarray]]:
     linear = linear - run.changes[..., :3] @ _aligning(run.changes, linear)
     # Every encoder is taken to be as good as the others: the noise of an angle is that of the table and the gimbals.
     noise = 0.5 * (1.0 + np.mean(run.changes[..., 6:10] ** 2, axis=0).sum(-1))
+    # What an error may follow must not hold the noise of the readings that it is the error of.
+    driver = {
+        name: mean(wave.real) + run.gimbals[:, i].mean()
+        for i, (name, (wave, _)) in enumerate(zip(GIMBALS, run.turns, strict=True))
+    }
     time, stretches = mean(run.time), []
     for a in range(3):
         wave, frequency = run.waves[a]
         signals = {
             "time": time,
-            "table": mean(run.table[:, a]),
+            "table": mean(wave.real) + run.table[:, a].mean(),
             "table_rate": mean(np.real(1j * frequency * wave)),
-            **{name: mean(run.gimbals[:, i]) for i, name in enumerate(GIMBALS)},
+            **driver,
             "_real": mean(wave.real),
             "_imaginary": mean(wave.imag),
             "_frequency": np.full(count, frequency),
@@ -200,7 +205,7 @@ def _stretches(run: _Run, phase: float) -> list[dict[str, np.ndarray]]:
             "_start": np.full(count, UNKNOWN),
             "_together": np.full(count, m),
         }
-        for shaft, (wave, frequency) in zip(SHAFTS, run.shafts, strict=True):
+        for shaft, (wave, frequency) in ((s, run.turns[GIMBALS.index(s)]) for s in SHAFTS):
             size = np.abs(wave[0])
             signals[f"_{shaft}_amplitude"] = np.full(count, size)
             signals[f"_{shaft}_frequency"] = np.full(count, frequency)
@@ -234,10 +239,10 @@ def _sine(time: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, float, float
     z = (a - 1j * b) * np.exp(1j * w * middle)
     left = angle - constant - z.real
     # White noise shows in differences, a motion does not.
-    noise = float(np.median(np.abs(np.diff(left))) / 0.954) ** 2
+    noise = 0.5 * float(np.mean(np.diff(left) ** 2))
     if 0.5 * n * abs(z[0]) ** 2 <= SEEN * max(noise, np.finfo(float).eps ** 2):
         return still
-    return z, w, float(np.sqrt(max(np.mean(left**2) - noise, 0.0) / np.mean(z.real**2)))
+    return z, w, float(np.sqrt(max(np.mean(left**2) - 2.0 * noise, 0.0) / np.mean(z.real**2)))
 
 
 @jax.jit
