@@ -83,6 +83,8 @@ def padded_length(rows: int) -> int:
 
 def rate_output(campaign: Campaign) -> tuple[np.ndarray, str]:
     """The output as a rate and its internal unit, whatever the campaign recorded."""
+    if not campaign.outputs:
+        raise CampaignError(f"{campaign.name}: is of a platform: `diagnose` and `platform.fit_vibration` take it")
     if "output" not in campaign.columns:
         axes = ", ".join(campaign.outputs)
         raise CampaignError(f"{campaign.name}: has outputs {axes}; choose one axis (--axis x, y or z)")

@@ -241,8 +241,8 @@ def line_frequencies(model: GyroModel) -> np.ndarray:
 def skipped(model: GyroModel, columns: Iterable[str]) -> set[str]:
     """Candidates that make no sense beside a model: what it has free, and what it has in a more general form.
 
-    What contains its own smaller forms may grow. Beside a bias proportional to one thermometer, one of a second thermometer is the same as one of their difference,
-    which keeps the name; unless the model has the second.
+    What contains its own smaller forms may grow. Beside a bias proportional to one thermometer, one of a second
+    thermometer is the same as one of their difference, which keeps the name; unless the model has the second.
     """
     held = model.wholly_fixed()
     have = {name for e in model.effects for name in (e.label, *e.supersedes)}

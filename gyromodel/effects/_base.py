@@ -65,8 +65,8 @@ class Effect(eqx.Module):
     `site` says where it acts in output = gain · (rate + Σ rate terms) · (1 + Σ scale terms), and `domain` whose output
     it is: that of a gyro, or the angle of a platform's base less that of its table, a sum of angle terms alone. Fields
     declared with `parameter` are its parameters. `columns` returns one column per linear coefficient, in field order,
-    and may depend on the nonlinear ones; the contribution is columns @ coefficients, so zero coefficients are exactly the model
-    without it.
+    and may depend on the nonlinear ones; the contribution is columns @ coefficients, so zero coefficients are exactly
+    the model without it.
     `supersedes` lists effects that this one contains as a special case; `held` the fields that physics
     or the search fixes; `positive` says that the (only) coefficient cannot be negative; `scan` names a fast search over
     every epoch or frequency; `untested` says why a campaign leaves it no `candidates`; `remembers` that a sample's
@@ -145,7 +145,7 @@ class Effect(eqx.Module):
         return tuple(f.name for f in fields(cls) if f.name not in (*cls.declared(), "column", "unit"))
 
     def joined(self, held: Effect) -> Self:
-        """What a model that holds the same effect in another form has of both; of this one the coefficients are zero."""
+        """What takes the place of the same effect in another form where a model holds that, without coefficients."""
         return self
 
     def settled(self) -> Self:

@@ -21,9 +21,8 @@ def export_calibration(calibration: Calibration, to: Form) -> str:
             it takes to compute the model elsewhere; "csv", one row a number.
 
     Raises:
-        ModelError: the model is of a platform, or an effect does not say which columns it reads; to C, one that looks at
-            other samples, or computes
-            what a few C statements cannot.
+        ModelError: the model is of a platform, or an effect does not say which columns it reads; to C, one that looks
+            at other samples, or computes what a few C statements cannot.
     """
     if calibration.model.domain == "platform":
         raise ModelError("a model of a platform's base corrects no gyro: only models of gyros are exported")

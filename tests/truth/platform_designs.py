@@ -47,7 +47,7 @@ TESTS = {"common": common, "narrow": narrow}
 def hidden(effect: str, size: float) -> Platform:
     """The platform with one effect at a size in its own unit."""
     change: dict[str, Any] = {
-        "": lambda: {},
+        "": dict,
         # s
         "sync_delay": lambda: {"offset": -size},
         # rad/s
