@@ -286,16 +286,20 @@ def parameter_unit(effect: Effect, field: str, output_unit: str, units: Mapping[
     return unit
 
 
+def check_domain(model: GyroModel, domain: Domain) -> None:
+    """Refuse a model of a gyro for a platform, and the other way round."""
+    if model.domain not in (domain, None):
+        named = f"effect {model.effects[0].label}" if model.effects else "the noise of the model"
+        raise ModelError(f"{named} is of {OF[model.domain]}, but the campaign is of {OF[domain]}")
+
+
 def check_units(model: GyroModel, output_unit: str, units: Mapping[str, str]) -> None:
     """Refuse a scale factor or a driver's coefficient that was written in a unit which does not suit the campaign.
 
     Counts may leave out "per second", in the output as in the scale factor: count/deg and count/(deg/s) mean the same.
     """
-    domain = domain_of(output_unit)
-    if model.domain not in (domain, None):
-        named = f"effect {model.effects[0].label}" if model.effects else "the noise of the model"
-        raise ModelError(f"{named} is of {OF[model.domain]}, but the campaign is of {OF[domain]}")
-    if output_unit != "rad/s" and domain == "gyro" and not any(e.site == "gain" for e in model.effects):
+    check_domain(model, domain_of(output_unit))
+    if output_unit not in ("rad/s", "rad") and not any(e.site == "gain" for e in model.effects):
         raise ModelError(f"the output is in [{output_unit}], which is no angular rate: the model needs a scale_factor")
     for effect in model.effects:
         foreign = [n for n in effect.columns_needed if n in units and not of_usual_unit(n, units[n])]

@@ -183,7 +183,7 @@ def _read_setting(place: Place, effect: Effect, name: str) -> Any:
     if isinstance(default, tuple | int):
         places = place.items(name) if isinstance(default, tuple) else [place]
         texts = [p.text() for p in places]
-        if isinstance(default, tuple) and isinstance(default[0], str):
+        if isinstance(default, tuple) and all(isinstance(each, str) for each in default):
             return tuple(texts)
         if not all(re.fullmatch(r"[-+]?\d{1,2}", text) for text in texts):
             raise place.error(f"{name} takes whole numbers below 100")

@@ -26,8 +26,7 @@ from gyromodel.model import GyroModel, ModelError, make_effect, model_from_effec
 from gyromodel.model_files import read_model, write_model
 from gyromodel.platform import fit_vibration, vibration_test
 from gyromodel.units import from_internal
-from tests.truth import platform_designs
-from tests.truth.platform_designs import simulation_with_friction, vibration
+from tests.truth.platform_designs import late_and_tilted, simulation_with_friction, vibration
 
 NOTHING = model_from_effects([])
 PLATFORM = sorted(name for name, kind in CATALOGUE.items() if kind.domain == "platform")
@@ -36,10 +35,10 @@ MS, ARCSEC, DEG_H = 1e-3, np.deg2rad(1 / 3600), np.deg2rad(1) / 3600
 HIDDEN = {
     "sync_delay": (0.03 * MS, "delay", 0.03),
     "loop_resonance": (500.0, "natural_frequency", 500.0 / (2 * np.pi)),
-    "shaft_friction": (0.05, "viscous[2]", 0.05 / (0.45 * 220.0 / 1.118)),
-    "gimbal_nonorthogonality": (5 * ARCSEC, "tilt", 5.0),
-    "encoder_harmonic": (5 * ARCSEC, "sine", 4.0),
-    "platform_drift": (0.4 * DEG_H, "rate[0]", -0.32),
+    "shaft_friction": (0.1, "viscous[2]", 0.1 / (0.45 * 220.0 / 1.118)),
+    "gimbal_nonorthogonality": (10 * ARCSEC, "tilt", 10.0),
+    "encoder_harmonic": (10 * ARCSEC, "sine", 8.0),
+    "platform_drift": (2.0 * DEG_H, "rate[0]", -1.6),
 }
 
 
@@ -70,22 +69,19 @@ def test_another_loop_is_named_where_the_friction_is_known(seed: int):
 
 
 @pytest.mark.parametrize("known", [False, True], ids=["no friction", "known friction"])
-def test_nothing_hidden_is_adequate(known: bool, seed: int):
-    """Without friction, or with the simulation's own: 3 campaigns each, of which the safe threshold loses 1 % at most.
-
-    All are right with 94 % or more; one may be wrong, which leaves less than 0.2 % for each kind.
-    """
-    log = ("loop_dynamics" if known else "", 0.0)
-    model = simulation_with_friction() if known else NOTHING
-    verdicts = [found(vibration(*log, seed=seed + k), model).verdict for k in range(3)]
-    assert verdicts.count("adequate") >= 2, verdicts
-    assert not known or "loop_dynamics" not in found(vibration(*log, seed=seed), model).not_testable
+def test_nothing_hidden_is_adequate(known: bool):
+    """Without friction, or with the simulation's own; of fresh seeds the benchmark tells."""
+    log = vibration("loop_dynamics" if known else "", 0.0, seed=1)
+    diagnosis = found(log, simulation_with_friction() if known else NOTHING)
+    assert diagnosis.verdict == "adequate"
+    assert set(diagnosis.not_testable) <= set(PLATFORM)
+    assert ("loop_dynamics" in diagnosis.not_testable) == (not known)
+    names = {n for n in (*diagnosis.searched, *diagnosis.not_testable) if not n.startswith(("smooth(", "outliers"))}
+    assert names == set(PLATFORM)
 
 
 def test_two_effects_are_both_named(seed: int):
-    design = platform_designs.hidden("sync_delay", 0.1 * MS)
-    design = design._replace(tilts=platform_designs.hidden("gimbal_nonorthogonality", 10 * ARCSEC).tilts)
-    diagnosis = found(vibration(seed=seed, more=design))
+    diagnosis = found(late_and_tilted(0.1 * MS, HIDDEN["gimbal_nonorthogonality"][0], seed))
     assert diagnosis.verdict == "named"
     assert {c.effect for c in diagnosis.causes} == {"sync_delay", "gimbal_nonorthogonality"}
 
@@ -100,11 +96,13 @@ def test_a_large_delay_is_no_slope(seed: int):
 
 def test_one_frequency_about_one_axis_cannot_tell(seed: int):
     """A delay and friction turn one phase of one amplitude alike: both are told of, and which test would part them."""
-    for effect, size in (("sync_delay", 0.05 * MS), ("shaft_friction", 0.1)):
-        diagnosis = found(vibration(effect, size, seed, "narrow"))
+    for effect in ("sync_delay", "shaft_friction"):
+        log = vibration(effect, HIDDEN[effect][0], seed)
+        # X alone, at the highest frequency.
+        diagnosis = found(log.select(log.columns["segment"] == 7))
         assert diagnosis.verdict == "ambiguous"
         assert {"sync_delay", "shaft_friction"} <= set(diagnosis.credible_set)
-        assert diagnosis.next_test is not None and "several frequencies" in diagnosis.next_test
+        assert "several frequencies" in str(diagnosis.next_test)
 
 
 def test_units_do_not_matter(seed: int):
@@ -121,7 +119,7 @@ def test_units_do_not_matter(seed: int):
 
 
 def test_the_command_writes_what_it_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str], seed: int):
-    gyromodel.files.write_campaign(vibration("sync_delay", 0.03 * MS, seed), tmp_path / "log.csv")
+    gyromodel.write_campaign(vibration("sync_delay", 0.03 * MS, seed), tmp_path / "log.csv")
     (tmp_path / "platform.yaml").write_text("gyro: fog-platform\neffects: []\n", encoding="utf-8")
 
     def run(*arguments: str) -> str:
@@ -132,11 +130,14 @@ def test_the_command_writes_what_it_reads(tmp_path: Path, capsys: pytest.Capture
 
     said = run("diagnose", "@log.csv", "--model", "@platform.yaml", "-o", "@found")
     assert said.startswith("Your simulation lacks a delay between the clocks of table and platform of (0.0")
-    assert " ms; with it the error on data not used falls from" in said and "deg/s" not in said
+    assert " ms; with it the error on data not used falls from" in said
+    assert "deg/s" not in said
     page = (tmp_path / "found" / "report.html").read_text(encoding="utf-8")
-    assert "White noise of the angle" in page and "rate noise" not in page
+    assert "White noise of the angle" in page
+    assert "rate noise" not in page
     model = read_model(tmp_path / "found" / "model.yaml")
-    assert model.labels == ("sync_delay",) and model.noise_of == "platform"
+    assert model.labels == ("sync_delay",)
+    assert model.noise_of == "platform"
     text = (tmp_path / "found" / "model.yaml").read_text(encoding="utf-8")
     assert "deg/sqrt(Hz)" in text
     # The extended model is valid input again: its noise is stated, and nothing is missing any more.
@@ -144,7 +145,8 @@ def test_the_command_writes_what_it_reads(tmp_path: Path, capsys: pytest.Capture
     run("fit", "@log.csv", "--model", "@found/model.yaml", "-o", "@fitted")
     fitted = json.loads((tmp_path / "fitted" / "fit.json").read_text(encoding="utf-8"))
     [delay] = [p for p in fitted["parameters"] if p["name"] == "delay"]
-    assert delay["value"] == pytest.approx(0.03, abs=5 * delay["std"]) and delay["std"] < 0.001
+    assert delay["value"] == pytest.approx(0.03, abs=5 * delay["std"])
+    assert delay["std"] < 0.001
 
 
 def test_platform_and_gyro_do_not_mix(tmp_path: Path):
@@ -153,7 +155,7 @@ def test_platform_and_gyro_do_not_mix(tmp_path: Path):
         found(log, model_from_effects(["bias_temperature"]))
     time = np.arange(100.0)
     gyro = Campaign({"time": time, "output": np.sin(time)}, {"time": "s", "output": "deg/h"}, {"kind": "rate"})
-    with pytest.raises(ModelError, match="sync_delay is of a platform's base in a vibration test, but .* of a gyro"):
+    with pytest.raises(ModelError, match=r"sync_delay is of a platform's base in a vibration test, but .* of a gyro"):
         found(gyro, model_from_effects(["sync_delay"]))
     with pytest.raises(CampaignError, match="is of a platform, and others are of a gyro"):
         gyromodel.diagnose([log, gyro], NOTHING)
@@ -176,16 +178,13 @@ def test_gyros_are_not_searched_for_effects_of_platforms():
     gyro = Campaign({"time": time, "output": output}, {"time": "s", "output": "deg/h"}, {"kind": "rate"})
     seen = found(gyro)
     assert not {*PLATFORM} & {*seen.searched, *seen.not_testable}
-    log = found(vibration())
-    names = {n for n in (*log.searched, *log.not_testable) if not n.startswith(("smooth(", "outliers"))}
-    assert names == set(PLATFORM)
     assert {name for name, entry in declarations().items() if entry.domain == "platform"} == set(PLATFORM)
 
 
 def test_runs_that_do_not_oscillate_are_left_out():
     log = vibration()
     run, time = log.columns["segment"], log.columns["time"]
-    swept = log.columns["table_x"] + np.where(run == 2, np.sin(0.3 * (time - time[run == 2][0]) ** 2), 0.0)
+    swept = log.columns["table_x"] + np.where(run == 2, np.sin(3.0 * (time - time[run == 2][0]) ** 2), 0.0)
     test = vibration_test(log.with_column("table_x", swept, "deg"))
     assert test.findings[0] == "Run 2 was left out: the motion of table_x is no oscillation of one frequency."
     assert test.record.rows < vibration_test(log).record.rows
@@ -225,7 +224,8 @@ def test_columns_and_files_of_each_effect(effect, tmp_path: Path):
         assert derivative == pytest.approx(slope, rel=1e-4, abs=1e-4 * np.abs(slope).max())
     write_model(GyroModel((effect,)), tmp_path / "one.yaml")
     again = read_model(tmp_path / "one.yaml")
-    assert np.array_equal(np.asarray(again.predict(signals)), np.asarray(value))
+    assert np.array_equal(np.asarray(again.predict(signals)), np.asarray(GyroModel((effect,)).predict(signals)))
+    assert np.asarray(value) == pytest.approx(np.asarray(again.predict(signals)), rel=1e-9, abs=1e-15)
 
 
 def test_what_is_written_wrong_is_refused():
