@@ -226,12 +226,12 @@ def refit(record: Record, baseline: Estimate, found: list[Found], noise: NoisePa
 
 
 def _shapes_held(model: GyroModel, found: list[Found]) -> GyroModel:
-    """The model with shapes at their searched values, but for effects that have no free coefficient besides."""
+    """The model with shapes at their searched values; an effect without a free coefficient keeps its last one free."""
     held = set()
     for effect in (f.effect for f in found if f.effect is not None):
         linear = {name for name, declared in effect.declared().items() if declared.linear}
-        if linear - set(effect.held):
-            held |= {(effect.label, name) for name in effect.declared() if name not in linear}
+        shapes = [name for name in effect.declared() if name not in linear]
+        held |= {(effect.label, name) for name in (shapes if linear - set(effect.held) else shapes[:-1])}
     return replace_fixed(model, model.fixed | frozenset(held))
 
 

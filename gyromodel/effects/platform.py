@@ -32,6 +32,8 @@ TILTS = tuple(
 PHASES = np.concatenate([[0.03, 0.2], np.arange(0.5, 6.6, 0.3)])
 LOWEST_MODE, HIGHEST_MODE, MODES, DAMPING = 0.5, 10.0, 25, (0.05, 0.2, 0.7)
 CORNERS = (3.0, 10.0, 30.0, 60.0, 120.0)
+# Hz from which a mount is none.
+STIFF = 1e4
 # Columns that keep less than this part of their length beside others cannot be seen beside them.
 SEEN = 0.02
 
@@ -122,8 +124,12 @@ class LoopResonance(_OfPlatform):
     untested = "no run oscillates about an axis"
 
     share: Float[Array, ""] = parameter("1", 1.0, "part of the motion that passes the mode", default=1.0)
-    natural_frequency: Float[Array, ""] = parameter("Hz", 20.0, "ω_n/2π of the mode", linear=False, default=20.0)
     damping: Float[Array, ""] = parameter("1", 0.1, "ζ of the mode", linear=False, default=0.1)
+    natural_frequency: Float[Array, ""] = parameter("Hz", 20.0, "ω_n/2π of the mode", linear=False, default=20.0)
+
+    def __check_init__(self) -> None:
+        if not (0 <= self.damping <= 1 and 0 < self.natural_frequency < STIFF):
+            raise ValueError("a mode has a damping from zero to one and a frequency below 10 kHz")
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """Re[(H(jω) − 1) z]."""

@@ -228,14 +228,17 @@ def _sine(time: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, float, float
     frequencies = 2 * np.pi * np.arange(padded // 2 + 1) / padded * (n - 1) / span
     even = np.interp(np.linspace(0.0, span, n), time, angle)
     power = np.abs(np.fft.rfft(even - even.mean(), padded)) ** 2
-    w = float(frequencies[4:][np.argmax(power[4:])])
+    # Slower than three quarters of a period is a drift; towards half the sample rate cosine and sine grow alike.
+    inside = slice(6, padded // 4)
+    w = float(frequencies[inside][np.argmax(power[inside])])
+    low, high = w - np.pi / (2 * span), w + np.pi / (2 * span)
     middle = time - 0.5 * span
     for _ in range(12):
         waves = np.column_stack([np.cos(w * middle), np.sin(w * middle), np.ones(n)])
         a, b, constant = np.linalg.lstsq(waves, angle, rcond=None)[0]
         slope = middle * (b * waves[:, 0] - a * waves[:, 1])
         steps = np.linalg.lstsq(np.column_stack([waves, slope]), angle - waves @ [a, b, constant], rcond=None)[0]
-        w = max(w + float(np.clip(steps[3], -1.0 / span, 1.0 / span)), 1e-3 / span)
+        w = float(np.clip(w + steps[3], low, high))
     z = (a - 1j * b) * np.exp(1j * w * middle)
     left = angle - constant - z.real
     # White noise shows in differences, a motion does not.
