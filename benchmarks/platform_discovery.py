@@ -94,11 +94,11 @@ def main(argv: list[str] | None = None) -> None:
     each = {t: ", ".join(f"{total[t, a]} {a}" for a in ANSWERS if total[t, a]) for t in TIMES}
     sums = "; ".join(f"at {t:g} times the smallest size {counts}" for t, counts in each.items())
     lines = [
-        "Fifteen runs of 2.4 s at 100 Hz: each axis by itself at 4, 9 and 20 rad/s with 0.5°, at 9 rad/s with 0.1° and at "
-        "4 rad/s with 30°; encoders with white noise of 1 arcsec, gyros with 1e-4 deg/√h; simulated as rigid bodies. "
-        "Nothing hidden is a platform whose shafts have no friction, or, for `loop_dynamics` and in the last row, one "
-        "whose friction and loop the simulation knows. The smallest size reaches the safe threshold with 80 %, as the "
-        f"evidence of a clear one has it. {given.seeds} campaigns of fresh noise each.",
+        "Fifteen runs of 2.4 s at 100 Hz: each axis by itself at 4, 9 and 20 rad/s with 0.5°, at 9 rad/s with 0.1°",
+        "and at 4 rad/s with 30°; encoders with white noise of 1 arcsec, gyros with 1e-4 deg/√h; simulated as rigid",
+        "bodies. Nothing hidden is a platform whose shafts have no friction, or, for `loop_dynamics` and in the last",
+        "row, one whose friction and loop are known. The smallest size reaches the safe threshold with 80 %,",
+        f"as the evidence of a clear one has it. {given.seeds} campaigns of fresh noise each.",
         "",
         *table(["hidden", "times smallest", "size", *ANSWERS], rows),
         "",

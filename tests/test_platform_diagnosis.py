@@ -63,9 +63,9 @@ def test_each_effect_is_named_with_its_size(effect: str, seed: int):
 def test_another_loop_is_named_where_the_friction_is_known(seed: int):
     diagnosis = found(vibration("loop_dynamics", -0.4, seed), simulation_with_friction())
     assert (diagnosis.verdict, [c.effect for c in diagnosis.causes]) == ("named", ["loop_dynamics"])
-    gain, std = values(diagnosis)["loop_dynamics.gain"]
+    compliance, std = values(diagnosis)["loop_dynamics.compliance"]
     # Crossover at 132 instead of 220 rad/s, where the lead has raised the gain by 1.06 and by 1.118.
-    assert gain == pytest.approx(0.6 * 1.118 / 1.05 - 1, abs=5 * std + 0.03)
+    assert compliance == pytest.approx(1.05 / (0.6 * 1.118) - 1, abs=5 * std + 0.03)
 
 
 @pytest.mark.parametrize("known", [False, True], ids=["no friction", "known friction"])
@@ -202,7 +202,15 @@ def filled() -> list:
     delay = dataclasses.replace(make_effect("sync_delay"), delay=0.01)
     drift = dataclasses.replace(make_effect("platform_drift"), rate=[1e-7, 2e-7, 3e-7])
     assert loop is not None
-    return [delay, make_effect("loop_resonance"), friction, dataclasses.replace(loop, gain=0.2), tilts, rings, drift]
+    return [
+        delay,
+        make_effect("loop_resonance"),
+        friction,
+        dataclasses.replace(loop, compliance=0.2),
+        tilts,
+        rings,
+        drift,
+    ]
 
 
 @pytest.mark.parametrize("effect", filled(), ids=lambda e: e.id)

@@ -149,7 +149,7 @@ class LoopResonance(_OfPlatform):
         if not len(hertz):
             return []
         modes = np.geomspace(LOWEST_MODE * hertz.min(), HIGHEST_MODE * hertz.max(), MODES)
-        return [cls(natural_frequency=f, damping=d) for f in modes for d in DAMPING]
+        return [cls(natural_frequency=f, damping=jnp.asarray(d)) for f in modes for d in DAMPING]
 
 
 class _ThroughLoop(_OfPlatform):
@@ -226,9 +226,9 @@ class ShaftFriction(_ThroughLoop):
     def candidates(cls, signals: Signals) -> list[Self]:
         """Viscous friction, Coulomb friction and both in all shafts that turn, through loops of several corners."""
         shafts = _turning(signals)
-        some, none = np.zeros(len(shafts)), np.zeros(0)
+        some, none = jnp.zeros(len(shafts)), jnp.zeros(0)
         kinds = ((some, none), (none, some), (some, some)) if shafts else ()
-        return [cls(v, c, w / (2.0 * np.pi), 5e-3, shafts) for v, c in kinds for w in CORNERS]
+        return [cls(v, c, jnp.asarray(w / (2.0 * np.pi)), shafts=shafts) for v, c in kinds for w in CORNERS]
 
 
 def _turning(signals: Signals) -> tuple[str, ...]:
@@ -237,7 +237,11 @@ def _turning(signals: Signals) -> tuple[str, ...]:
 
 
 class LoopDynamics(_ThroughLoop):
-    """θ −= what the friction of the shafts turns the platform by, through a loop of another gain or correction."""
+    """θ −= what the friction of the shafts turns the platform by, through a loop of another gain or correction.
+
+    As `shaft_friction` with R = s/((s + ω_i)/(1 + κ) + s²/ω_c): far below the crossover it lets 1 + κ times as much
+    through, of a gain K_0 that is 1/(1 + κ) of the simulated one.
+    """
 
     id = "loop_dynamics"
     needs = ("table_<axis>", "gimbal_<axis>")
@@ -245,14 +249,18 @@ class LoopDynamics(_ThroughLoop):
     test = "Measure the loop's step response, or oscillate at another gain of the amplifier: friction stays as it is."
     supersedes = ("shaft_friction",)
     held = ("viscous", "coulomb", "lag")
-    reach = 0.9
+    reach = 20.0
     untested = "a loop shows only in what friction it lets through, and the model has no shaft_friction of known size"
 
-    gain: Float[Array, ""] = parameter("1", 0.1, "gain of the loop over the simulated one, less one", linear=False)
+    compliance: Float[Array, ""] = parameter("1", 0.1, "κ: what it lets through, less one", linear=False)
+
+    def __check_init__(self) -> None:
+        if self.compliance <= -1:
+            raise ValueError("a loop lets something through: its compliance is above -1")
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """Of each shaft's viscous friction, then of its Coulomb friction."""
-        return self.turned(signals, 1.0 + self.gain)
+        return self.turned(signals, 1.0 / (1.0 + self.compliance))
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
@@ -373,7 +381,7 @@ class EncoderHarmonic(_OfPlatform):
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
         """Terms of one gimbal, and of all."""
-        return [cls(np.zeros(len(t)), np.zeros(len(t)), t) for t in cls._shown(signals)]
+        return [cls(jnp.zeros(len(t)), jnp.zeros(len(t)), t) for t in cls._shown(signals)]
 
 
 def _shows(signals: Signals, terms: tuple[str, ...]) -> bool:

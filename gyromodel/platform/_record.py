@@ -184,7 +184,7 @@ def _stretches(run: _Run, phase: float) -> list[dict[str, np.ndarray]]:
     noise = 0.5 * (1.0 + np.mean(run.changes[..., 6:10] ** 2, axis=0).sum(-1))
     # What an error may follow must not hold the noise of the readings that it is the error of.
     driver = {
-        name: mean(wave.real) + run.gimbals[:, i].mean()
+        name: mean(np.real(wave)) + run.gimbals[:, i].mean()
         for i, (name, (wave, _)) in enumerate(zip(GIMBALS, run.turns, strict=True))
     }
     time, stretches = mean(run.time), []
@@ -192,11 +192,11 @@ def _stretches(run: _Run, phase: float) -> list[dict[str, np.ndarray]]:
         wave, frequency = run.waves[a]
         signals = {
             "time": time,
-            "table": mean(wave.real) + run.table[:, a].mean(),
+            "table": mean(np.real(wave)) + run.table[:, a].mean(),
             "table_rate": mean(np.real(1j * frequency * wave)),
             **driver,
-            "_real": mean(wave.real),
-            "_imaginary": mean(wave.imag),
+            "_real": mean(np.real(wave)),
+            "_imaginary": mean(np.imag(wave)),
             "_frequency": np.full(count, frequency),
             "output": mean(run.output[:, a]),
             "_interval": np.full(count, m * run.time[-1] / (len(run.time) - 1)),
@@ -211,7 +211,7 @@ def _stretches(run: _Run, phase: float) -> list[dict[str, np.ndarray]]:
             signals[f"_{shaft}_frequency"] = np.full(count, frequency)
             for n in ODD:
                 passed = mean(gimbals[shaft][:, a] * (wave / size if size else wave) ** n)
-                signals |= {f"_{shaft}_{n}_real": passed.real, f"_{shaft}_{n}_imaginary": passed.imag}
+                signals |= {f"_{shaft}_{n}_real": np.real(passed), f"_{shaft}_{n}_imaginary": np.imag(passed)}
         names = (*tilts, *drifts, *terms)
         stretches.append(signals | {f"_{n}": v for n, v in zip(names, mean(linear[:, a]).T, strict=True)})
     return stretches
