@@ -31,7 +31,7 @@ TILTS = tuple(
 # highest frequency, where modes are searched; their damping; corners of loops (rad/s).
 PHASES = np.concatenate([[0.03, 0.2], np.arange(0.5, 6.6, 0.3)])
 LOWEST_MODE, HIGHEST_MODE, MODES, DAMPING = 0.5, 10.0, 25, (0.05, 0.2, 0.7)
-CORNERS = (3.0, 10.0, 30.0, 60.0, 120.0)
+CORNERS = (5.0, 15.0, 30.0, 60.0, 150.0)
 # Hz from which a mount is none.
 STIFF = 1e4
 # Columns that keep less than this part of their length beside others cannot be seen beside them.
@@ -224,10 +224,10 @@ class ShaftFriction(_ThroughLoop):
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
-        """Viscous friction, Coulomb friction and both in all shafts that turn, through loops of several corners."""
+        """Viscous friction, and Coulomb friction beside it, in all shafts that turn; loops of several corners."""
         shafts = _turning(signals)
         some, none = jnp.zeros(len(shafts)), jnp.zeros(0)
-        kinds = ((some, none), (none, some), (some, some)) if shafts else ()
+        kinds = ((some, none), (some, some)) if shafts else ()
         return [cls(v, c, jnp.asarray(w / (2.0 * np.pi)), shafts=shafts) for v, c in kinds for w in CORNERS]
 
 
