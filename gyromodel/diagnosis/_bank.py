@@ -43,7 +43,8 @@ class Block:
     """Columns of one form of one candidate; they stand at `start` … `start + width` of the bank.
 
     Forms of one `structure` differ only in the values of nonlinear parameters. `along` is what a driver's first column
-    is drawn over.
+    is drawn over; `least` the smallest
+    coefficient of a positive effect.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Block:
     structure: str
     effect: Effect | None
     along: np.ndarray | None = field(default=None, repr=False)
+    least: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -132,7 +134,18 @@ def build_bank(record: Record) -> Bank:
     for i in order:
         name, kind_of, shape, effect = blocks[i]
         width = shape.shape[1]
-        laid.append(Block(name, kind_of, start, width, _structure(name, effect, width), effect, along.get(i)))
+        laid.append(
+            Block(
+                name,
+                kind_of,
+                start,
+                width,
+                _structure(name, effect, width),
+                effect,
+                along.get(i),
+                effect.least(signals) if effect is not None else 0.0,
+            )
+        )
         start += shape.shape[1]
     columns = np.concatenate([blocks[i][2] for i in order], axis=1) if blocks else np.zeros((len(rate), 0))
     return Bank(columns, tuple(laid), tuple(scans), not_testable)

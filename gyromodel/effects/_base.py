@@ -144,6 +144,10 @@ class Effect(eqx.Module):
         """Fields that are neither parameters nor the column and unit of a driver."""
         return tuple(f.name for f in fields(cls) if f.name not in (*cls.declared(), "column", "unit"))
 
+    def least(self, signals: Signals) -> float:
+        """The smallest coefficient with which a `positive` form means anything: a share of one, say, not of 1e-3."""
+        return 0.0
+
     def joined(self, held: Effect) -> Self:
         """What takes the place of the same effect in another form where a model holds that, without coefficients."""
         return self

@@ -32,6 +32,8 @@ TILTS = tuple(
 PHASES = np.concatenate([[0.03, 0.2], np.arange(0.5, 6.6, 0.3)])
 LOWEST_MODE, HIGHEST_MODE, MODES, DAMPING = 0.5, 10.0, 25, (0.05, 0.2, 0.7)
 CORNERS = (5.0, 15.0, 30.0, 60.0, 150.0)
+# A share that is not small, and phases (rad), or frequencies over that of a mode, below which any share will do.
+LEAST, SLIGHT = 0.5, 0.3
 # Hz from which a mount is none.
 STIFF = 1e4
 # Columns that keep less than this part of their length beside others cannot be seen beside them.
@@ -95,6 +97,10 @@ class SyncDelay(_OfPlatform):
         turned = jnp.exp(-1j * signals["_frequency"] * self.delay) - 1.0
         return stack(jnp.real(turned * _oscillation(signals)))
 
+    def least(self, signals: Signals) -> float:
+        """Little of a motion that is much late would turn phases as nothing does that has one delay."""
+        return LEAST if float(jnp.abs(self.delay)) * _frequencies(signals).max() > SLIGHT else 0.0
+
     def settled(self) -> Self:
         """All of the motion is late, by as much as has the same slope."""
         return type(self)(share=jnp.ones(()), delay=self.share * self.delay)
@@ -136,6 +142,10 @@ class LoopResonance(_OfPlatform):
         s = 1j * signals["_frequency"] / (2.0 * jnp.pi * self.natural_frequency)
         carried = 1.0 + 2.0 * self.damping * s
         return stack(jnp.real((carried / (carried + s**2) - 1.0) * _oscillation(signals)))
+
+    def least(self, signals: Signals) -> float:
+        """Little of a motion that passes a mode within the band would turn phases as no mount does."""
+        return LEAST if float(self.natural_frequency) * SLIGHT < _frequencies(signals).max() / (2.0 * np.pi) else 0.0
 
     def settled(self) -> Self:
         """All of the motion passes a mode that does as much far below it."""
