@@ -69,11 +69,17 @@ def _cell(values: np.ndarray) -> str:
 
 def explanations(phase_std: np.ndarray | None) -> dict[str, Any]:
     """Every alternative fitted to the printed table."""
+    from gyromodel.estimate import EstimateError
     from gyromodel.platform import ALTERNATIVES, FREQUENCIES, PRINTED_GAIN, PRINTED_PHASE, explain, points
 
     printed = PRINTED_GAIN.ravel(), PRINTED_PHASE.ravel()
-    at = points(FREQUENCIES)
-    return {name: explain(a, at, *printed, signed=False, phase_std=phase_std) for name, a in ALTERNATIVES.items()}
+    at, found = points(FREQUENCIES), {}
+    for name, alternative in ALTERNATIVES.items():
+        try:
+            found[name] = explain(alternative, at, *printed, signed=False, phase_std=phase_std)
+        except EstimateError as error:
+            print(f"{name}: {error}", file=sys.stderr)
+    return found
 
 
 def _entries(found: Any, part: slice, unit: float) -> str:
@@ -93,6 +99,8 @@ def table_of_explanations() -> tuple[list[list[str]], dict[str, Any]]:
     best = [min(e.criterion for e in group.values()) for group in (same, growing)]
     rows, inertia = [], float(Loop().inertia)
     for name, e in sorted(same.items(), key=lambda item: item[1].criterion):
+        if name not in growing:
+            continue
         rows.append(
             [
                 name,
@@ -101,8 +109,10 @@ def table_of_explanations() -> tuple[list[list[str]], dict[str, Any]]:
                 f"{e.scatter[0]:.3f}, {e.scatter[1]:.2f}",
                 _entries(e, slice(0, 3), 1e3),
                 _entries(e, slice(3, 6), 1 / inertia),
-                _entries(e, slice(6, 9), 1e6),
-                _entries(e, slice(9, 10), 1e3),
+                _entries(e, slice(6, 9), 1e3 / inertia),
+                _entries(e, slice(9, 12), 1e6),
+                _entries(e, slice(12, 13), 1e3),
+                _entries(e, slice(13, 14), 1.0),
             ]
         )
     return rows, same
@@ -168,12 +178,24 @@ def main(argv: list[str] | None = None) -> None:
         "Each alternative fitted to twelve amplitudes and twelve phases without sign, whose scatter (dB, deg) is what "
         "the fit leaves. Δ is Akaike's criterion (corrected for few points) above the best: with equal scatter of all "
         "phases, and with one that grows as 1 + ω s. Values are of equal scatter; time offset in ms, friction c/J of "
-        "X, Y, Z in 1/s, compliance 1/ω_n² of X, Y, Z in 1e-6 s², lag 2ζ/ω_n in ms. What would be negative is held "
-        "at zero. Friction acts through the default loop unless said: integration from 40 rad/s down; quick, from 120 "
-        "rad/s; double, twice from 48 rad/s.",
+        "X, Y, Z in 1/s, dry friction M/J in 1e-3 rad/s², compliance 1/ω_n² of X, Y, Z in 1e-6 s², lag 2ζ/ω_n in ms, "
+        "corner of the integration in rad/s, where it is fitted. What would be negative is held at zero; what the "
+        "points do not determine is not listed. Friction acts through the default loop unless said: integration from "
+        "40 rad/s down; quick, from 120 rad/s; double, twice from 48 rad/s.",
         "",
         *table(
-            ["alternative", "Δ", "Δ, growing", "scatter", "time offset", "friction", "compliance", "lag"],
+            [
+                "alternative",
+                "Δ",
+                "Δ, growing",
+                "scatter",
+                "time offset",
+                "friction",
+                "dry",
+                "compliance",
+                "lag",
+                "corner",
+            ],
             rows,
         ),
         "",

@@ -31,6 +31,8 @@ from gyromodel._checks import (
 )
 
 AXES = ("x", "y", "z")
+# Beyond this size a value is a mark of something else, and its square no number.
+LARGEST = 1e100
 _OUTPUT = re.compile(r"output(_[xyz])?")
 
 
@@ -213,7 +215,13 @@ def _restore(columns: Mapping[str, Any], units: Mapping[str, str], metadata: Map
 
 
 def _check_usable(campaign: Campaign) -> None:
-    """What a model needs: an output of known kind that varies, or gimbal angles, in three rows or more."""
+    """What a model needs: three rows of usable numbers, with an output of known kind that varies, or gimbal angles."""
+    for name, values in campaign.columns.items():
+        if (far := np.abs(values) > LARGEST).any():
+            raise CampaignError(
+                f"column '{name}' is {values[far][0]:g} at data row {first(far)}, which nothing measures: leave "
+                "the cell empty where a sample is missing"
+            )
     outputs = campaign.outputs
     if not outputs and len(campaign) >= 3 and any(name.startswith("gimbal_") for name in campaign.columns):
         return  # a platform tells its attitude by its gimbals

@@ -48,7 +48,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")  # an equation's ε must not stop a terminal that lacks it
-    keep_compiled()
+    if not {"--help", "--version"} & {*(sys.argv[1:] if arguments is None else arguments)}:
+        keep_compiled()
     try:
         typer.main.get_command(app)(args=arguments, prog_name="gyromodel")
     except Exception as error:
@@ -294,20 +295,105 @@ def navigate(
 
 
 @app.command()
+def batch(
+    archive: Annotated[
+        str, typer.Argument(metavar="ARCHIVE", help="Folder, quoted pattern, Zarr group, or Parquet manifest.")
+    ],
+    model: ModelFile,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="RESULTS.parquet", help="The table to write.")],
+    diagnose: Annotated[bool, typer.Option("--diagnose", help="Diagnose each campaign rather than fit it.")] = False,
+    workers: Annotated[int, typer.Option(min=1, metavar="N", help="Processes of a local cluster.")] = 1,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="A Dask cluster, such as tcp://host:8786.", show_default=False)
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Fit every campaign of an archive into one table; killed, it goes on where it was.
+
+    A campaign that cannot be read or fitted is a row with its reason, and the exit status is then 1.
+    """
+    if output.suffix != ".parquet":
+        raise typer.BadParameter("the table is a Parquet file: end its name in .parquet", param_hint="--output")
+    refuse_overwriting(output, [model, Path(archive)])
+    from hashlib import sha256
+
+    from gyromodel.batch import run_batch
+    from gyromodel.model_files import read_model
+
+    start, digest = read_model(model), sha256(model.read_bytes()).hexdigest()
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with progress_bar() as progress:
+        done = run_batch(
+            archive, start, digest, output,
+            diagnosing=diagnose, workers=workers, scheduler=scheduler, progress=progress,
+        )  # fmt: skip
+    result = {"results": str(output), "campaigns": done.campaigns, "examined": done.examined, "failed": done.failed}
+    if as_json:
+        print(json_text(result), end="")
+    else:
+        print(f"{done.campaigns} campaigns, {done.examined} examined in this run; {len(done.table)} rows in {output}")
+    if done.failed:
+        print(f"gyromodel: {done.failed} of {done.campaigns} campaigns failed: see column reason", file=sys.stderr)
+        sys.exit(1)
+
+
+@app.command()
+def units(
+    results: Annotated[Path, typer.Argument(metavar="RESULTS.parquet", help="What batch has written.")],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="FILE.parquet", help="Campaigns' parameters as all units tell them."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Tell how the units of an archive spread, which stand out, and which drift."""
+    if output:
+        refuse_overwriting(output, [results])
+    from gyromodel.batch import pooled_table, read_results, unit_statistics
+    from gyromodel.batch import write_table as write
+
+    table = read_results(results)
+    found = unit_statistics(table)
+    if output:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        write(pooled_table(table, found), output)
+    if as_json:
+        print(json_text([statistics.to_dict() for statistics in found]), end="")
+        return
+    from gyromodel.report import with_uncertainty
+
+    rows = [
+        (f"{s.parameter}{' ' * bool(s.axis)}{s.axis}", str(s.units), str(s.campaigns),
+         with_uncertainty(s.mean, s.mean_std, s.unit), f"{s.between.value:.3g}", f"{s.within.value:.3g}")
+        for s in found
+    ]  # fmt: skip
+    print_table(("parameter", "units", "campaigns", "mean", "unit to unit", "campaign to campaign"), rows)
+    for line in (line for statistics in found for line in statistics.sentences()):
+        print(f"- {line}")
+
+
+@app.command()
 def export(
     model: Annotated[Path, typer.Argument(metavar="M.yaml", help="A model with values.")],
-    to: Annotated[Literal["c", "json", "csv"], typer.Option("--to", help="C99 source, JSON, or CSV.")],
+    to: Annotated[
+        Literal["c", "json", "csv", "px4"], typer.Option("--to", help="C99 source, JSON, CSV, or PX4 parameters.")
+    ],
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="File to write; printed without.")
     ] = None,
+    axis: Axis = None,
 ) -> None:
-    """Write a calibration for firmware and spreadsheets."""
+    """Write a calibration for firmware and spreadsheets; to PX4, that of one axis."""
+    if (to == "px4") != (axis is not None):
+        raise typer.BadParameter(
+            "PX4 parameters, and these alone, are of one axis: --to px4 --axis x", param_hint="--axis"
+        )
     if output:
         refuse_overwriting(output, [model])
     from gyromodel.export import export_calibration
     from gyromodel.model_files import read_calibration
 
-    text = export_calibration(read_calibration(model), to)
+    text = export_calibration(read_calibration(model), to, axis or "x")
     if output:
         write_text(output, text)
     else:
@@ -338,6 +424,33 @@ def allan(
     print_table(("noise", "", "value", "95 % from", "to", "unit", "verdict"), noise_rows(analysis))
     print("".join(f"\n{remark}\n" for remark in analysis.remarks), end="")
     print_paths(output, "allan.json", "allan.svg")
+
+
+@app.command()
+def vibration(
+    campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Log of a platform on a vibration table.")],
+    output: Folder,
+    as_json: AsJson = False,
+) -> None:
+    """Amplitude and phase of a gyro-stabilised platform on an angular vibration table, and what explains them."""
+    from gyromodel.platform import vibration_test
+    from gyromodel.report import vibration_figures, vibration_words
+
+    [measured] = read_campaigns([campaign], None)
+    with progress_bar() as progress:
+        test = vibration_test(measured, progress)
+    result, figures = test.to_dict(), vibration_figures(test)
+    output.mkdir(parents=True, exist_ok=True)
+    write_text(output / "vibration.json", json_text(result))
+    for name, figure in figures.items():
+        write_text(output / f"{name}.svg", figure)
+    if as_json:
+        print(json_text(result), end="")
+        return
+    words = vibration_words(test)
+    print_table(words.head, words.runs)
+    print("".join(f"\n{line}" for line in words.lines))
+    print_paths(output, "vibration.json", *(f"{name}.svg" for name in figures))
 
 
 @app.command()

@@ -48,7 +48,9 @@ def read_campaign(path: str | os.PathLike[str]) -> Campaign:
                 f"a {suffix} campaign is a {'folder' if suffix == '.zarr' else 'file'}, and this is none"
             )
         columns, units, metadata = _READERS[suffix](path)
-        return Campaign(columns, units, metadata, path.name[: -len(suffix)])
+        return Campaign(
+            columns, units, metadata, path.name[: -len(suffix)] if suffix in path.name.lower() else path.name
+        )
     except CampaignError as error:
         raise CampaignError(f"{path}: {error}") from error
     except OSError as error:
@@ -78,10 +80,17 @@ def write_campaign(campaign: Campaign, path: str | os.PathLike[str]) -> None:
         raise CampaignError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
+def is_zarr(path: Path) -> bool:
+    """Whether a folder is a Zarr group or array."""
+    return any((path / name).exists() for name in (*_ZARR_FILES, ".zarray"))
+
+
 def _suffix(path: Path) -> str:
     for suffix in _READERS:
         if path.name.lower().endswith(suffix) and len(path.name) > len(suffix):
             return suffix
+    if is_zarr(path):
+        return ".zarr"
     raise CampaignError(f"the name does not say what the file is: expected a name ending in {', '.join(_READERS)}")
 
 
@@ -299,3 +308,5 @@ _WRITERS: dict[str, Callable[[Campaign, Path], None]] = {
     ".nc": _write_netcdf,
     ".zarr": _write_zarr,
 }
+# What the name of a campaign ends in.
+SUFFIXES = tuple(_READERS)

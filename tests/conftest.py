@@ -37,12 +37,13 @@ def pytest_report_header() -> str:
     return f"GYROMODEL_TEST_SEED={os.environ['GYROMODEL_TEST_SEED']} repeats this run's random draws"
 
 
+@pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the tests marked `long`, shared between two workers: each is dealt half of the list, in order."""
-    long = [item for item in items if item.get_closest_marker("long")]
-    rest = [item for item in items if not item.get_closest_marker("long")]
-    half = len(items) // 2 - len(long[::2])
-    items[:] = [*long[::2], *rest[:half], *long[1::2], *rest[half:]]
+    """Begin with the longest, those of test_discovery.py, shared between two workers: each is dealt half, in order."""
+    first = [item for item in items if "test_discovery" in item.nodeid and item.get_closest_marker("long")]
+    rest = [item for item in items if item not in first]
+    half = len(items) // 2 - len(first[::2])
+    items[:] = [*first[::2], *rest[:half], *first[1::2], *rest[half:]]
 
 
 @pytest.hookimpl(wrapper=True)

@@ -189,6 +189,7 @@ def test_effects_as_json(run: Run):
     assert {"equation", "needs", "cause", "test", "parameters"} <= set(one)
 
 
+@pytest.mark.long
 def test_plan_tells_what_could_be_told_apart(tmp_path: Path, run: Run):
     """One ramp: temperature and time are one line, which the table, the tests and the JSON form all say."""
     (tmp_path / "plan.yaml").write_text(
@@ -376,7 +377,8 @@ def test_export_prints_or_writes(fitted: Path, run: Run, to: str, part: str):
 
 
 def test_export_lists_its_forms(run: Run):
-    assert "'c', 'json', 'csv'" in run("export", "m.yaml", "--to", "px4").err
+    assert "'c', 'json', 'csv', 'px4'" in run("export", "m.yaml", "--to", "matlab").err
+    assert "--to px4 --axis x" in run("export", "m.yaml", "--to", "px4").err
 
 
 def test_export_refuses_a_model_without_values(bench: Path, run: Run):

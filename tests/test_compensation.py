@@ -247,6 +247,7 @@ def test_a_dead_band_hides_the_rate_and_says_so():
     assert result.metadata["rate_estimated_std_holds"] == "white noise of one sample"
 
 
+@pytest.mark.long
 def test_fits_cover_the_truth_as_often_as_they_claim(rng: np.random.Generator):
     """The rate of one more sample, by a calibration on 30: Student's t of the fit's degrees of freedom."""
     gain, bias, kappa, level = 1e3, 0.01, 0.7, 1e-3

@@ -17,11 +17,13 @@ from scipy.signal import lfilter
 from scipy.special import gammaln
 
 import gyromodel as gm
+from gyromodel.averages import average
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores
 from gyromodel.diagnosis._evidence import SIZES, explained_for, log_evidence_ratio
 from gyromodel.diagnosis._ranking import rank
 from gyromodel.diagnosis._scan import Scanner
+from gyromodel.diagnosis._verdict import _places
 from gyromodel.estimate import EstimateError, fit_record
 from gyromodel.model import record_span
 from gyromodel.noise import NoiseGrid, NoiseRatios, markov_sum
@@ -160,6 +162,7 @@ def test_an_effect_whose_fit_fails_is_told_and_not_tried_again(monkeypatch: pyte
     assert any("bias_temperature is still significant" in line for line in found.findings)
 
 
+@pytest.mark.long
 def test_diagnosing_the_extended_model_finds_nothing_more(rng: np.random.Generator) -> None:
     ramp = 8.0 * np.sin(2 * np.pi * 20.0 * np.arange(ROWS) / 4000.0)
     campaign = static_log(rng, ramp)
@@ -212,6 +215,7 @@ def test_ring_laser_table_is_four_points_or_a_curve() -> None:
     assert line["scale_factor"].value == pytest.approx(77348, abs=20)
 
 
+@pytest.mark.long
 def test_fiber_optic_rig_is_named_and_the_error_falls(measured_data) -> None:
     campaign = gm.read_campaign(measured_data("fog_rate_temperature/campaign.csv.gz"))
     found = gm.diagnose(campaign, gm.model_from_effects(["scale_factor", "bias"]))
@@ -307,6 +311,7 @@ def test_several_lines_are_one_cause(rng: np.random.Generator) -> None:
     assert frequency == pytest.approx([0.0031, 0.0117], abs=tolerance)
 
 
+@pytest.mark.long
 def test_many_gross_errors_are_given_up_together(rng: np.random.Generator) -> None:
     """More of them than the search has rounds, beside a bias over temperature."""
     wild = np.sort(rng.choice(ROWS // 5, 20, replace=False)) * 5
@@ -319,6 +324,16 @@ def test_many_gross_errors_are_given_up_together(rng: np.random.Generator) -> No
     assert [c.effect for c in found.causes] == ["bias_temperature"]
     rows = ", ".join(str(row + 1) for row in wild[:12])
     assert f"20 gross errors in data rows {rows}…: given up, not modelled." in found.findings
+
+
+def test_a_gross_error_is_told_where_it_is_in_its_file(rng: np.random.Generator) -> None:
+    first, second = static_log(rng), static_log(rng, np.where(np.arange(ROWS) == 100, 40.0, 0.0))
+    second = gm.Campaign(second.columns, second.units, second.metadata, name="second")
+    found = gm.diagnose([first, second], gm.model_from_effects(["bias"]), hold_out=False)
+    assert "A gross error in data row 101 of second: given up, not modelled." in found.findings
+    halved, together = average(second, ROWS // 2)
+    assert together == 2
+    assert _places([50, 52], [(halved, False)]) == "at 2010 s, 2090 s"
 
 
 def test_many_steps_are_a_function_of_time_and_no_cause(rng: np.random.Generator) -> None:

@@ -18,11 +18,11 @@ from tests.truth.noise import OUTSIDE
 from tests.truth.study import SLOW
 from tests.truth.verdicts import ACCEPTED
 
-# Engine calls; tuned so that the file takes minutes on two cores.
-NULLS, MOVING, STRANGE = 20, 5, 5  # in noise of the family, the same on the move, in other noise anywhere
+# Engine calls, each some seconds.
+NULLS, MOVING, STRANGE = 40, 10, 10  # in noise of the family, the same on the move, in other noise anywhere
 NAMES = len({e for d in HOMES for e in TESTABLE[d]})
-EFFECTS_1, EFFECTS_3, EFFECTS_10 = 4, 15, 5  # other effects each run
-UNKNOWN_3, UNKNOWN_10 = 8, 4  # of 8 uncatalogued effects
+EFFECTS_1, EFFECTS_3, EFFECTS_10 = 20, 60, 20  # other effects each run
+UNKNOWN_3, UNKNOWN_10 = 16, 8  # of 8 uncatalogued effects
 RETRIES = 5  # further draws of an effect that was missed once
 WORKERS = 1 if "PYTEST_XDIST_WORKER" in os.environ else 2
 

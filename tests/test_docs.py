@@ -40,6 +40,7 @@ def simulate_demo(folder: Path) -> None:
     gyromodel.write_campaign(campaign, folder / "campaign.csv")
 
 
+@pytest.mark.long
 def test_every_python_block_of_the_readme_runs(tmp_path: Path):
     simulate_demo(tmp_path / "gyromodel-demo" / "fiber_optic")
     (tmp_path / "blocks.py").write_text("\n".join(BLOCKS), encoding="utf-8")
@@ -52,6 +53,7 @@ def test_every_python_block_of_the_readme_runs(tmp_path: Path):
     assert f"# {', '.join(printed[3:])}\n" in README
 
 
+@pytest.mark.long
 def test_the_first_answer_is_what_the_demo_finds(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     simulate_demo(tmp_path)
     block = next(b for b in re.findall(r"^```yaml\n(.*?)^```$", README, re.MULTILINE | re.DOTALL) if "noise: auto" in b)

@@ -84,6 +84,7 @@ def run(source: str, folder: Path, rows: dict[str, np.ndarray]) -> np.ndarray:
         "#include <stdio.h>",
         "int main(void) {",
         "    gyromodel_sample s;",
+        "    if (gyromodel_self_test()) return 1;",
         f"    while (scanf({form}, {places}) == {len(members)})",
         '        printf("%.17g\\n", gyromodel_rate(&s));',
         "    return 0;",
@@ -283,3 +284,88 @@ def test_a_model_that_was_not_fitted_has_no_uncertainty():
     assert {p["std"] for e in said["effects"] for p in e["parameters"]} == {None}
     rows = csv.DictReader(io.StringIO(export_calibration(calibration, "csv")))
     assert {row["std"] for row in rows} == {""}
+
+
+def params(text: str) -> dict[str, float]:
+    rows = [line.split("\t") for line in text.splitlines() if not line.startswith("#")]
+    assert all(row[:2] == ["1", "1"] and row[4] == ("6" if row[2] == "TC_G_ENABLE" else "9") for row in rows)
+    return {row[2]: float(row[3]) for row in rows}
+
+
+def thermal(*more: Effect) -> Calibration:
+    curve = BiasTemperatureCurve(
+        coefficients=jnp.array([2e-5, -1e-6, 3e-8]),
+        hinges=jnp.zeros(0),
+        breakpoints=jnp.zeros(0),
+        reference=jnp.asarray(30.0),
+    )
+    effects = (Bias(value=jnp.asarray(1e-3)), curve, *more)
+    return Calibration(GyroModel(effects), validity={"temperature": (-10.0, 60.0)})
+
+
+def px4_offset(values: dict[str, float], axis: int, temperature: np.ndarray) -> np.ndarray:
+    """As the autopilot computes it: PX4-Autopilot, TemperatureCompensation.cpp."""
+    delta = np.clip(temperature, values["TC_G0_TMIN"], values["TC_G0_TMAX"]) - values["TC_G0_TREF"]
+    return sum(values[f"TC_G0_X{k}_{axis}"] * delta**k for k in range(4))
+
+
+def test_px4_takes_off_the_offset_of_the_model():
+    """A cubic of temperature is one again about another temperature."""
+    values = params(export_calibration(thermal(), "px4", "y"))
+    assert values["TC_G_ENABLE"] == 1
+    assert (values["TC_G0_TREF"], values["TC_G0_TMIN"], values["TC_G0_TMAX"]) == (25.0, -10.0, 60.0)
+    temperature = np.linspace(-10.0, 60.0, 50)
+    t = (temperature - 30.0) / 10.0
+    expected = 1e-3 + 2e-5 * t - 1e-6 * t**2 + 3e-8 * t**3
+    assert px4_offset(values, 1, temperature) == pytest.approx(expected, abs=2e-10)
+    assert not any(name.endswith("_0") for name in values)
+
+
+def test_px4_of_a_bias_alone_holds_everywhere():
+    text = export_calibration(Calibration(GyroModel((Bias(value=jnp.asarray(2e-3)),))), "px4", "z")
+    values = params(text)
+    assert values == {"TC_G_ENABLE": 1, "TC_G0_X0_2": pytest.approx(2e-3, rel=1e-7)} | {
+        f"TC_G0_X{k}_2": 0.0 for k in (1, 2, 3)
+    }
+
+
+@pytest.mark.parametrize(
+    "more", [SCALE, BiasTemperatureRate(coefficient=jnp.asarray(1e-3)), ScaleNonlinearity(full_rate=jnp.ones(()))]
+)
+def test_what_px4_has_no_parameter_for_is_refused(more: Effect):
+    with pytest.raises(ModelError, match=f"PX4 has no parameter for (a gyro's )?{more.label}"):
+        export_calibration(thermal(more), "px4", "x")
+
+
+def test_px4_states_how_far_a_cubic_is_from_a_bend():
+    bend = BiasTemperatureCurve(
+        coefficients=jnp.zeros(3), hinges=jnp.array([1e-5]), breakpoints=jnp.array([25.0]), reference=jnp.asarray(25.0)
+    )
+    calibration = Calibration(GyroModel((bend,)), validity={"temperature": (-10.0, 60.0)})
+    text = export_calibration(calibration, "px4", "x")
+    said = np.deg2rad(float(re.search(r"single precision: (\S+) deg/s", text)[1]))
+    temperature = np.linspace(-10.0, 60.0, 500)
+    missed = px4_offset(params(text), 0, temperature) - 1e-5 * np.maximum(temperature - 25.0, 0.0)
+    assert np.abs(missed).max() == pytest.approx(said, rel=0.1)
+
+
+@needs_compiler
+def test_the_self_test_fails_when_a_constant_is_wrong(tmp_path: Path):
+    source = export_calibration(Calibration(GyroModel((SCALE, Bias(value=jnp.asarray(0.1))))), "c")
+    wrong = source.replace("const double bias_value = 0.1", "const double bias_value = 0.1001")
+    assert wrong != source
+    rows = {"output_count_per_s": np.zeros(1)}
+    assert run(source, tmp_path, rows) == pytest.approx([-0.1])
+    with pytest.raises(subprocess.CalledProcessError):
+        run(wrong, tmp_path, rows)
+
+
+def test_rounding_is_stated_as_large_as_it_is():
+    """Output 1500 (ω + 0.1) count: up to 1650 single precision rounds by 6e-5, fixed point below 2048 by 5e-7."""
+    source = export_calibration(Calibration(GyroModel((SCALE, Bias(value=jnp.asarray(0.1))))), "c")
+    single, fixed = (
+        np.deg2rad(float(re.search(pattern, source)[1]))
+        for pattern in (r"errors of (\S+) deg/s at most", r"binary point, of (\S+) deg/s")
+    )
+    assert 3e-8 < single < 1e-7
+    assert 2e-10 < fixed < 8e-10

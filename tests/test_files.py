@@ -19,26 +19,24 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from gyromodel._checks import CampaignError
-from gyromodel.campaign import Campaign
+from gyromodel.campaign import LARGEST, Campaign
 from gyromodel.files import read_campaign, write_campaign
 from tests.helpers import MUTANTS, SHARED_FOLDER, mutated, small_campaign
 
 FORMATS = (".csv", ".csv.gz", ".parquet", ".nc", ".zarr")
-finite = st.floats(allow_nan=False, allow_infinity=False)
+finite = st.floats(-LARGEST, LARGEST)
 # Names that promise nothing about unit or value.
 names = st.from_regex(r"[A-Z0-9µ][A-Za-z0-9_ .()%+°é-]{0,12}", fullmatch=True).filter(lambda text: text == text.strip())
 texts = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=20)
 numbers = st.integers(-(2**63) + 1, 2**63 - 1) | finite
 number_texts = numbers.map(repr) | st.sampled_from(["007", "+5", "1_000", "1e999", ".5", "-0", "nan", '"quoted"', '"'])
-values = st.floats(allow_infinity=False)
+values = st.one_of(finite, st.just(float("nan")))
 
 
 @st.composite
 def contents(draw: st.DrawFn) -> tuple[dict[str, np.ndarray], dict[str, str], dict[str, Any]]:
     """Columns, units and metadata; the campaign is made in the test, as the type checker draws random numbers."""
-    time = sorted(
-        draw(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=3, max_size=12, unique=True))
-    )
+    time = sorted(draw(st.lists(finite, min_size=3, max_size=12, unique=True)))
     n = len(time)
     outputs = draw(st.sampled_from([("output",), ("output_x",), ("output_z", "output_x")]))
     others = draw(

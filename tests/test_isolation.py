@@ -59,6 +59,7 @@ def test_sizes_are_those_of_least_squares_in_white_noise():
     assert 4.0 < needed < 5.2
 
 
+@pytest.mark.long
 def test_what_is_one_line_is_never_told_apart():
     found = isolability(log(20 + 0.1 * np.arange(200.0)), known_noise("bias"))
     assert found.apart["bias_temperature", "bias_drift"].value > 1e3 * found.detectable["bias_temperature"].value
@@ -88,6 +89,7 @@ def test_the_predicted_distance_is_the_measured_rate_of_confusion(rng: np.random
     assert binomtest(int(wrong), 400, 0.2).pvalue > RARE
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("seed", "effect"), [(1, "bias_temperature"), (2, "bias_drift"), (4, "bias_drift")])
 def test_the_next_test_settles_what_was_ambiguous(seed: int, effect: str):
     """One ramp: a bias over temperature is a drift. The truth lives on through the test that is asked for.

@@ -112,6 +112,7 @@ def without(safeguard: str, given: Campaign, *, hold_out: bool = False) -> Diagn
         return gyromodel.diagnose(given, MODEL, hold_out=hold_out)
 
 
+@pytest.mark.long
 def test_each_safeguard_is_needed(first: Diagnosis):
     """Campaigns with nothing hidden, and `first`, whose answers go wrong with one safeguard off."""
     nothing = campaign(0.0, 8)

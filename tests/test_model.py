@@ -223,6 +223,7 @@ def truth(noise: dict[str, float]) -> GyroModel:
     )
 
 
+@pytest.mark.long
 def test_fit_of_a_simulation_covers_its_parameters(rng: np.random.Generator):
     """Counts of 4e6 next to 1e-9 rad/s, no start values, noise of three kinds estimated alongside."""
     model = truth({"noise_white": 5e-9, "noise_flicker": 4e-10, "noise_random_walk": 4e-12})

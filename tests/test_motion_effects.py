@@ -104,6 +104,7 @@ def test_simulated_delay_and_lag_have_their_frequency_response(rng: np.random.Ge
     assert error("output_axis_acceleration", design, 2.0, {}) == pytest.approx(2 * omega * np.cos(omega * t + phase))
 
 
+@pytest.mark.long
 def test_delay_lag_and_slope_keep_to_their_stretch():
     """Two runs end to end, a gap in the first, and padding: against numbers of each stretch alone."""
     stretches = [np.arange(20.0), 300 + np.arange(15.0), np.arange(12.0)]
@@ -190,6 +191,7 @@ EXACT = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("design", EXACT)
 def test_exact_confusions_are_told_of(design: str):
     members, test = EXACT[design]
@@ -212,6 +214,7 @@ def test_exact_confusions_are_told_of(design: str):
         assert np.sum(rates * force, axis=0) == pytest.approx(np.sum(before * force, axis=0), abs=1e-4 * EARTH)
 
 
+@pytest.mark.long
 def test_delay_and_lag_are_one_to_first_order_and_two_beyond():
     built = study.build(study.Case(1, "dynamic_rates", "white", "time_delay", 3.0))
     assert built.truth.amplitude > 0.2 * built.design.step
@@ -247,6 +250,7 @@ columns:
 """
 
 
+@pytest.mark.long
 def test_a_plan_of_positions_tells_what_it_shows(tmp_path):
     (tmp_path / "plan.yaml").write_text(PLAN, encoding="utf-8")
     model = GyroModel(model_from_effects(["bias"]).effects, {"noise_white": jnp.asarray(1e-3 * DEG_H)})

@@ -55,6 +55,26 @@ def test_a_body_over_one_place_stays_there(turning: float, tmp_path: Path, capsy
     assert json.loads(capsys.readouterr().out)["rows"] == ROWS
 
 
+def in_other_unit(campaign: Campaign, columns: str, unit: str, kind: str) -> Campaign:
+    units = dict(campaign.units) | {n: unit for n in campaign.columns if n.startswith(columns)}
+    return Campaign(campaign.columns, units, dict(campaign.metadata) | {"kind": kind})
+
+
+def upside_down(campaign: Campaign) -> Campaign:
+    """Accelerometers that read gravity instead of what holds the body against it."""
+    for name in ("acceleration_x", "acceleration_y", "acceleration_z"):
+        campaign = campaign.with_column(name, -campaign.columns[name], "m/s^2")
+    return campaign
+
+
+def east_north_up(campaign: Campaign) -> Campaign:
+    """The same body, its attitude by the commoner order of axes."""
+    to = Rotation.from_matrix([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    for name, value in zip([f"attitude_{p}" for p in "xyzw"], (to * START).as_quat(), strict=True):
+        campaign = campaign.with_column(name, np.full(ROWS, value), "")
+    return campaign
+
+
 @pytest.mark.parametrize(
     ("broken", "said"),
     [
@@ -66,6 +86,16 @@ def test_a_body_over_one_place_stays_there(turning: float, tmp_path: Path, capsy
             "output_z is missing",
         ),
         (lambda c: c.with_column("attitude_w", np.full(ROWS, 3.0), ""), "no unit quaternion"),
+        (lambda c: c.with_metadata({"longitude_deg": "12.5E"}), "'longitude_deg' is '12.5E', expected a number"),
+        (lambda c: c.with_metadata({"height_m": "sea level"}), "'height_m' is 'sea level'"),
+        (lambda c: c.with_metadata({"height_m": 1e9}), "specific force"),
+        (lambda c: c.with_metadata({"latitude_deg": 90}), "89.99 deg of latitude"),
+        (lambda c: c.select(slice(0, 3)), "3 rows, and navigation needs 4"),
+        (lambda c: in_other_unit(c, "output", "deg", "increment"), "needs rates, and metadata 'kind' is increment"),
+        (lambda c: in_other_unit(c, "output", "count", "rate"), "which does not convert to [rad/s]"),
+        (lambda c: in_other_unit(c, "acceleration", "count", "rate"), "which does not convert to [m/s^2]"),
+        (upside_down, "(0, 9.8, 0): either is in other axes"),
+        (east_north_up, "(0, 9.8, 0): either is in other axes"),
     ],
 )
 def test_what_cannot_be_navigated_is_refused(broken, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

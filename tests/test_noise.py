@@ -116,6 +116,7 @@ def test_stated_coefficients_are_the_ratios_they_came_from(rng: np.random.Genera
         assert [float(r) for r in again] == pytest.approx([float(r) for r in ratios], rel=1e-9)
 
 
+@pytest.mark.long
 def test_strong_markov_noise_is_found_with_its_size_and_time(rng: np.random.Generator):
     """White noise that a process of 20 to 40 samples exceeds 14-fold at its time constant, in 3072 samples."""
     rows, model, N = 3072, model_from_effects(["bias"]), 1e-6
@@ -202,6 +203,7 @@ def with_rows(rows: int) -> Record:
     return read_signals(Campaign(columns, {"time": "s", "output": "rad/s"}, {"kind": "rate"}))
 
 
+@pytest.mark.long
 def test_intervals_cover_independently_simulated_noise(rng: np.random.Generator):
     """N, B and K of white, flicker, random walk and both, levels as in a real gyro: 95 % by the binomial law."""
     record, model = with_rows(ROWS), model_from_effects(["bias"])

@@ -127,6 +127,7 @@ def test_maximise_finds_maxima_inside_and_at_bounds():
     assert maximise(hills, start, both, np.array([0.9, 0.0]), np.array([9.0, 9.0]))[0][0, 0] == 0.9
 
 
+@pytest.mark.long
 def test_grouping_changes_neither_values_nor_intervals(monkeypatch: pytest.MonkeyPatch):
     """White noise, quantisation and a walk that leads beyond the groups, on rows that the filter can still take all."""
     rng = np.random.default_rng(3)
@@ -161,6 +162,7 @@ def test_each_kind_is_found_beside_white_noise(key: str, size: float, fixed: np.
         assert low < true < high, (name, term)
 
 
+@pytest.mark.long
 def test_white_noise_alone_is_seldom_anything_else(rng: np.random.Generator):
     """Eight records: each other kind exceeds its threshold in 0.5 % of them, and four kinds are tried."""
     other, covered = 0, 0
@@ -207,6 +209,7 @@ def test_noise_alone_seldom_shows_a_line(walk: float, rng: np.random.Generator):
     assert binom.sf(found - 1, 400, 1e-3) > RARE
 
 
+@pytest.mark.long
 def test_limits_of_lines_and_of_unseen_markov_noise_hold(rng: np.random.Generator):
     """A line, and a Markov process too small to be found: its bound holds, and is not far above it."""
     time, constant, q = np.arange(ROWS) * STEP, 10.0, 2.5e-3
@@ -234,6 +237,7 @@ def test_gaps_and_missing_samples_do_not_matter(fixed: np.random.Generator):
     assert found.terms["noise_white"].high > N * 0.9
 
 
+@pytest.mark.long
 def test_lines_keep_their_size_across_gaps(fixed: np.random.Generator):
     """Two parts so far apart that the phase is lost, and single samples missing, where it must be carried on."""
     time = np.arange(2400) * STEP

@@ -17,6 +17,7 @@ FEWEST_TOO_MANY_CELLS, LARGEST = 15, 400_000
 TIMEOUT = 300  # s a cell, on a busy machine
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_runs_and_is_committed_with_its_outputs(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -24,7 +24,7 @@ from gyromodel.effects._base import evaluate
 from gyromodel.effects.platform import ENCODERS, SHAFTS, TILTS, EncoderHarmonic, ShaftFriction
 from gyromodel.model import GyroModel, ModelError, make_effect, model_from_effects
 from gyromodel.model_files import read_model, write_model
-from gyromodel.platform import fit_vibration, vibration_test
+from gyromodel.platform import fit_vibration, vibration_record
 from gyromodel.units import from_internal
 from tests.truth.platform_designs import late_and_tilted, simulation_with_friction, vibration
 
@@ -191,9 +191,9 @@ def test_runs_that_do_not_oscillate_are_left_out():
     log = vibration()
     run, time = log.columns["segment"], log.columns["time"]
     swept = log.columns["table_x"] + np.where(run == 2, np.sin(3.0 * (time - time[run == 2][0]) ** 2), 0.0)
-    test = vibration_test(log.with_column("table_x", swept, "deg"))
+    test = vibration_record(log.with_column("table_x", swept, "deg"))
     assert test.findings[0] == "Run 2 was left out: the motion of table_x is no oscillation of one frequency."
-    assert test.record.rows < vibration_test(log).record.rows
+    assert test.record.rows < vibration_record(log).record.rows
 
 
 def filled() -> list:
@@ -222,7 +222,7 @@ def filled() -> list:
 @pytest.mark.parametrize("effect", filled(), ids=lambda e: e.id)
 def test_columns_and_files_of_each_effect(effect, tmp_path: Path):
     """What an effect hands over equals automatic differentiation, and comes back from its file the same."""
-    signals = vibration_test(vibration()).record.signals
+    signals = vibration_record(vibration()).record.signals
     columns, shapes, value = evaluate(effect, signals)
     linear = jax.jacfwd(lambda x: effect.with_linear(x).contribution(signals))(effect.linear())
     assert np.asarray(columns) == pytest.approx(np.asarray(linear), rel=1e-9, abs=1e-15)

@@ -70,6 +70,7 @@ def test_without_poses_or_accelerations_there_is_a_sentence(rng: np.random.Gener
         static_poses(campaign.select(slice(0, 250)))
 
 
+@pytest.mark.long
 def test_what_gravity_adds_is_named_and_judged_by_means_of_poses():
     """The truth is 0.004 rad/s per g; noise of 0.01 rad/s a row leaves 0.01/√300 = 6e-4 in the mean of a pose."""
     rng = np.random.default_rng(6)

@@ -9,7 +9,7 @@ from scipy.interpolate import make_smoothing_spline
 from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter, savgol_filter
 
-from gyromodel.numerics.smoothing import _best_penalty, smooth_derivative, smoothing_bandwidth
+from gyromodel.numerics.smoothing import _best_fit, smooth_derivative, smoothing_bandwidth
 
 ROWS, STEP = 1800, 10.0
 TIME = np.arange(ROWS) * STEP
@@ -72,7 +72,7 @@ def test_the_penalty_is_that_of_exact_cross_validation(rng: np.random.Generator)
         return np.log(np.sum(left**2) / np.trace(np.eye(60) - matrix) ** 2 * (0.3 + 0.7 * squares))
 
     exact = minimize_scalar(criterion, bounds=(-2, 12), method="bounded", options={"xatol": 0.05}).x
-    ours = _best_penalty(x, y)
+    ours = _best_fit(x, y)[0]
     assert criterion(np.log(ours)) < criterion(exact) + 0.02
 
 
@@ -84,7 +84,7 @@ def test_the_bandwidth_is_where_a_sine_falls_to_its_half_power(rows: int, rng: n
     block = -(-rows // 400)
     knots = time.reshape(-1, block).mean(axis=1)
     unit = (knots[-1] - knots[0]) / len(knots)
-    penalty = _best_penalty((knots - knots[0]) / unit, measured.reshape(-1, block).mean(axis=1))
+    penalty = _best_fit((knots - knots[0]) / unit, measured.reshape(-1, block).mean(axis=1))[0]
     wave = np.sin(2 * np.pi * edge * time)
     spline = make_smoothing_spline((knots - knots[0]) / unit, wave.reshape(-1, block).mean(axis=1), lam=penalty)
     middle = slice(rows // 4, -rows // 4)

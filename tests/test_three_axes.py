@@ -68,6 +68,7 @@ def test_axes_that_are_not_square_are_the_unit(rng: np.random.Generator):
     assert "which is the unit" in found.sentence()
 
 
+@pytest.mark.long
 def test_axes_as_they_should_be_say_so(rng: np.random.Generator):
     """A true triad is called turned, or not square, once in a thousand each."""
     claimed = [t.turned + t.oblique for t in (lie(np.eye(3), rng) for _ in range(8))]

@@ -298,6 +298,7 @@ def test_scan_for_a_step_has_about_the_power_the_mde_promises(rng):
     assert 0.70 < power < 0.97
 
 
+@pytest.mark.long
 def test_oracle_names_a_strong_effect_and_least_squares_is_fooled_by_flicker(seed):
     names = {e for d in HOMES for e in TESTABLE[d]}
     records = study.run_cases(study.effect_cases(len(names), seed, 3.0), engine=False)

@@ -12,7 +12,7 @@ from gyromodel.attitude import with_reference_rates
 from gyromodel.averages import MEAN_OF_ATTITUDE, MOST_TURN, average, turning
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._variance import steps_of_output
-from gyromodel.platform import is_platform, vibration_test
+from gyromodel.platform import is_platform, vibration_record
 from gyromodel.poses import at_rest
 from gyromodel.signals import Record, read_signals
 from gyromodel.units import convertible
@@ -28,6 +28,7 @@ class Data:
     Attributes:
         record: the signals.
         searched: the campaigns that a further test could repeat; none of a platform.
+        rows_of: the campaigns that rows are told of, and whether they are as given.
         whole: one campaign with the record's rows, which reports show.
         findings: what was done to the measured data, in sentences.
         unit: that errors are told in.
@@ -36,6 +37,7 @@ class Data:
 
     record: Record
     searched: tuple[Campaign, ...]
+    rows_of: tuple[tuple[Campaign, bool], ...]
     whole: Campaign
     findings: tuple[str, ...]
     unit: str
@@ -46,8 +48,8 @@ def read(measured: Sequence[Campaign]) -> Data:
     """Campaigns of one gyro, or logs of one platform, as they are searched."""
     of_platform = [is_platform(c) for c in measured]
     if all(of_platform):
-        test = vibration_test(measured)
-        return Data(test.record, (), test.campaign, test.findings, "deg", "deg")
+        test = vibration_record(measured)
+        return Data(test.record, (), ((test.campaign, False),), test.campaign, test.findings, "deg", "deg")
     if any(of_platform):
         raise CampaignError(f"{measured[of_platform.index(True)].name} is of a platform, and others are of a gyro")
     return _of_gyro(measured)
@@ -86,7 +88,10 @@ def _of_gyro(measured: Sequence[Campaign]) -> Data:
     if campaigns[0].metadata["kind"] != "rate":
         output_unit = f"{output_unit}/s"
     whole = searched[0] if len(searched) == 1 else _together(searched)
-    return Data(read_signals(searched), searched, whole, tuple(findings), _rate_unit(campaigns[0]), output_unit)
+    rows_of = tuple((c, c is m) for c, m in zip(searched, measured, strict=True))
+    return Data(
+        read_signals(searched), searched, rows_of, whole, tuple(findings), _rate_unit(campaigns[0]), output_unit
+    )
 
 
 def _rate_unit(campaign: Campaign) -> str:

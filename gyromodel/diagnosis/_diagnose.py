@@ -22,8 +22,8 @@ from gyromodel.diagnosis._result import Candidate, Cause, Diagnosis, Gain, Param
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import SLOW_IN_TIME, Found, NoisePath, Progress, Selection, search, standing
 from gyromodel.diagnosis._shapes import driver_shape, minimum_detectable, not_testable
-from gyromodel.diagnosis._variance import growing_noise, noise_level, tails, with_variance
-from gyromodel.diagnosis._verdict import judge, with_noise
+from gyromodel.diagnosis._variance import follow, growing_noise, noise_level, tails, with_variance
+from gyromodel.diagnosis._verdict import judge, structured, with_noise
 from gyromodel.estimate import Estimate, EstimateError, check_covariates, fit_record, with_noise_intervals
 from gyromodel.model import GyroModel, record_span
 from gyromodel.noise import NoiseGrid, NoiseRatios, noise_grid
@@ -109,7 +109,7 @@ def diagnose(
         session.threshold = max(float(np.quantile(nulls, 0.99)), 0.0)
     selection = session.run(baseline, say)
     beyond: list[Cause] = []
-    grows = growing_noise(record, selection.estimate)
+    grows, following = growing_noise(record, selection.estimate), None
     if grows is not None:
         weighted = with_variance(record, grows.white)
         try:
@@ -130,8 +130,11 @@ def diagnose(
             f"The noise level follows {grows.driver}, {times:.3g} times as large at one end as at the other; samples "
             "are weighted accordingly."
         )
-        ratio = ParameterValue("ratio", grows.ratio, grows.ratio_std, "1")
-        beyond.append(as_cause("noise_heteroscedastic", grows.evidence, ratio))
+        if following := follow(selection.estimate, grows):
+            findings.append(following)
+        else:
+            ratio = ParameterValue("ratio", grows.ratio, grows.ratio_std, "1")
+            beyond.append(as_cause("noise_heteroscedastic", grows.evidence, ratio))
     free = _with_noise_estimated(selection.estimate)
     hops = telegraph(baseline, free, unit) if free and record.domain == "gyro" and _like_hops(selection, free) else None
     if hops is not None:
@@ -154,7 +157,9 @@ def diagnose(
             "Parameters weigh all samples alike: that predicts left-out blocks better than the fitted noise's weights "
             "do."
         )
-    judgement = judge(record, session.scanner, baseline, selection, extended, len(bank.names()), nulls)
+    judgement = judge(record, session.scanner, baseline, selection, extended, len(bank.names()), nulls, data.rows_of)
+    if following and grows and judgement.verdict == "adequate":
+        judgement = structured(judgement, selection.last, grows.column)
     stepped = None
     if record.domain == "gyro" and not _unfinished(selection) and (free := _with_noise_estimated(selection.estimate)):
         stepped = quantisation(free, session.threshold)

@@ -9,11 +9,14 @@ import numpy as np
 from scipy import stats
 
 from gyromodel.campaign import Campaign
+from gyromodel.declarations import RATE_OF
 from gyromodel.estimate import Estimate
 from gyromodel.noise_analysis import quantum
 from gyromodel.signals import Record
 
 SIGNIFICANT = 1e-5
+# Standard deviations from which on the residuals of a high noise level follow one another.
+FOLLOW = 4.0
 HEAVY = 6.0
 # Two-sided significance at which a stated noise level is contradicted.
 CONTRADICTED = 1e-4
@@ -57,6 +60,11 @@ class Growth(NamedTuple):
     ratio_std: float
     evidence: float
 
+    @property
+    def column(self) -> str:
+        """What the driver is made of."""
+        return RATE_OF.format("temperature") if "temperature rate" in self.driver else self.driver.strip("|")
+
 
 def growing_noise(record: Record, estimate: Estimate) -> Growth | None:
     """The driver that the noise level follows most; None where it follows none."""
@@ -97,6 +105,21 @@ def _log_slope(x: np.ndarray, square: np.ndarray) -> float:
 def with_variance(record: Record, white: np.ndarray) -> Record:
     """The record with another relative white variance of each sample."""
     return record._replace(sampling=record.sampling._replace(white=jnp.asarray(white)))
+
+
+def follow(estimate: Estimate, grows: Growth) -> str | None:
+    """A sentence where residuals of a high level follow one another, in time or along the driver, as noise does not."""
+    white = grows.white[: estimate.record.rows]
+    high = np.flatnonzero(np.isfinite(estimate.whitened) & (white > np.median(white)))
+    for order in (high, high[np.argsort(white[high], kind="stable")]):
+        e = estimate.whitened[order]
+        product = e[1:] * e[:-1]
+        if np.abs(product.sum()) > FOLLOW * np.linalg.norm(product):
+            return (
+                f"Residuals at that end of {grows.driver} follow one another: something that no effect searched "
+                "describes may be taken for noise there."
+            )
+    return None
 
 
 def tails(estimate: Estimate) -> str | None:

@@ -9,6 +9,7 @@ from math import comb
 import numpy as np
 from scipy import stats
 
+from gyromodel.campaign import Campaign
 from gyromodel.declarations import EARLIER, RATE_OF, measured
 from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise
@@ -101,16 +102,16 @@ def judge(
     extended: Estimate,
     trials: int,
     null_scores: np.ndarray,
+    searched: Sequence[tuple[Campaign, bool]],
 ) -> Judgement:
-    """The verdict on a finished search."""
+    """The verdict on a finished search; `searched`: the record's campaigns, and whether they are as given."""
     found = list(selection.found)
     runs = scanner.runs
     causes, sets, findings = [], [], []
     given_up = sorted(row for step in found if step.name == "outliers" for row in step.rows)
     if given_up and not scanner.by_points:
-        some = ", ".join(str(row + 1) for row in given_up[:ROWS_TOLD]) + ("…" if len(given_up) > ROWS_TOLD else "")
-        what = f"{len(given_up)} gross errors in data rows" if len(given_up) > 1 else "A gross error in data row"
-        findings.append(f"{what} {some}: given up, not modelled.")
+        what = f"{len(given_up)} gross errors" if len(given_up) > 1 else "A gross error"
+        findings.append(f"{what} {_places(given_up, searched)}: given up, not modelled.")
     for i, step in enumerate(found):
         ranking, name = selection.left_out.get(i), step.name
         if ranking is None and len(found) > 1 and not uncontested(step):
@@ -174,6 +175,27 @@ def judge(
     firm = tuple(c for c in named if c.effect not in sets[0])
     test = _next_test(list(sets[0]), record, causes[0])
     return Judgement("ambiguous", (*doubtful, *firm), sets[0], None, test, unexplained, tuple(findings))
+
+
+def _places(rows: Sequence[int], searched: Sequence[tuple[Campaign, bool]]) -> str:
+    """Where rows of the record are in the files: by row, or by time where rows were left out or averaged."""
+    begins = np.cumsum([0, *(len(c) for c, _ in searched)])
+    by_row, some = all(as_given for _, as_given in searched), []
+    for row in rows[:ROWS_TOLD]:
+        i = int(np.searchsorted(begins, row, side="right")) - 1
+        campaign, own = searched[i][0], row - begins[i]
+        place = f"{own + 1}" if by_row else f"{campaign.columns['time'][own]:.10g} {campaign.units['time']}"
+        some.append(place + (f" of {campaign.name}" if len(searched) > 1 else ""))
+    how = "at" if not by_row else "in data rows" if len(rows) > 1 else "in data row"
+    return f"{how} {', '.join(some)}{'…' if len(rows) > ROWS_TOLD else ''}"
+
+
+def structured(judgement: Judgement, ranking: Ranking, column: str) -> Judgement:
+    """The judgement where what passes for noise at one end of a column has a structure that nothing searched has."""
+    name = f"smooth({column})"
+    driver = name if name in ranking.statistic else None
+    test = f"Repeat the campaign over that end of {column} alone, sampled more densely: what returns there is no noise."
+    return replace(judgement, verdict="unknown", credible_set={name: 1.0}, driver=driver, next_test=test)
 
 
 def with_noise(judgement: Judgement, beyond: Sequence[Cause], trials: int) -> Judgement:

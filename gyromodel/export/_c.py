@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import textwrap
+from collections.abc import Iterable
 from pathlib import Path
 from string import Template
 
@@ -32,6 +33,10 @@ SIGNAL_MEANINGS = {
 }
 # Three samples are lowered and the middle one is written: what stands for its neighbours must not be needed.
 NEIGHBOUR = "neighbour"
+# Samples that rounding is tried on, and how many of them the file holds; where they lie, if no range is calibrated.
+TRIALS, TESTS = 200, 8
+SPANS = {"time": (0.0, 3600.0), "time_on": (0.0, 3600.0), "temperature": (0.0, 40.0)}
+RATES = (-0.02, 0.02)
 
 
 def as_c(calibration: Calibration) -> str:
@@ -61,7 +66,7 @@ def as_c(calibration: Calibration) -> str:
         if name == "output" or f"x->{member}" in reached
     ]
     return Template(TEMPLATE.read_text(encoding="utf-8")).substitute(
-        about=_about(calibration),
+        about=_about(calibration, _rounding(calibration, members)),
         members="\n".join(fields),
         constants="\n".join(f"    {line}" for line in _constants(calibration, reached)),
         statements="\n".join(f"    {line}" for line in statements),
@@ -73,7 +78,67 @@ def as_c(calibration: Calibration) -> str:
         waypoints=WAYPOINTS,
         tolerance=literal(TOLERANCE),
         level=literal(LEVEL),
+        tests=_tests(calibration, members, [n for n, m in members.items() if n == "output" or f"x->{m}" in reached]),
     )
+
+
+def _trials(calibration: Calibration, names: Iterable[str]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Samples all over the calibrated ranges, by name and without their output, and the rates that they are of."""
+    rng = np.random.default_rng(0)
+    low, high = calibration.validity.get("rate", (-1.0, 1.0))
+    rate = np.concatenate([np.linspace(low, high, TRIALS // 2), rng.uniform(low, high, TRIALS // 2)])
+    signals = {}
+    for name in set(names) - {"output"}:
+        ends = calibration.validity.get(name, SPANS.get(name, (0.0, 1.0)))
+        signals[name] = rng.uniform(*(RATES if name.endswith("_rate") else ends), TRIALS)
+    return signals, rate
+
+
+@jax.jit
+def _output_and_slope(model: GyroModel, signals: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    output, slope = output_and_slope(model, signals)
+    return output, slope / model.gain()
+
+
+def _at(model: GyroModel, signals: dict[str, np.ndarray], rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Output, and its slope over the gain."""
+    output, slope = _output_and_slope(model, jax.tree.map(jnp.asarray, signals | {"rate": rate}))
+    return np.asarray(output), np.asarray(slope)
+
+
+def _tests(calibration: Calibration, names: Iterable[str], written: list[str]) -> str:
+    """Samples with their rates, as initialisers in C."""
+    model = calibration.model
+    signals, rate = _trials(calibration, names)
+    output, slope = _at(model, signals, rate)
+    # Where the output rises all the way from rest, and steeply enough there to tell the rate.
+    known = slope > 1e-3
+    for part in np.arange(WAYPOINTS + 1) / (WAYPOINTS + 1):
+        known &= _at(model, signals, part * rate)[1] > -LEVEL
+    rows = {**signals, "output": output}
+    chosen = np.flatnonzero(known)
+    chosen = chosen[:: max(len(chosen) // TESTS, 1)][:TESTS]
+    lines = [", ".join(literal(float(rows[n][i])) for n in written) + f"}}, {literal(float(rate[i]))}" for i in chosen]
+    return "\n".join(f"        {{{{{line}}}," for line in lines) or "        {{0}, NAN},"
+
+
+def _rounding(calibration: Calibration, names: Iterable[str]) -> tuple[float, float]:
+    """Largest error of a rate whose sample and constants are rounded: to single precision, to 32-bit fixed point."""
+    signals, rate = _trials(calibration, names)
+    output, slope = _at(calibration.model, signals, rate)
+
+    def fixed(x: np.ndarray) -> np.ndarray:
+        largest = np.abs(x).max(initial=0.0)
+        unit = 2.0 ** (np.ceil(np.log2(largest)) - 31) if largest > 0 else 1.0
+        return np.asarray(np.round(x / unit) * unit)
+
+    errors = []
+    for rounded in (lambda x: np.asarray(x.astype(np.float32), float), fixed):
+        model = jax.tree.map(lambda x, f=rounded: jnp.asarray(f(np.asarray(x, float))), calibration.model)
+        made = _at(model, {name: rounded(x) for name, x in signals.items()}, rate)[0]
+        error = (rounded(output) - made)[slope > 0.1] / float(model.gain()) / slope[slope > 0.1]
+        errors.append(float(np.abs(error).max(initial=0.0)))
+    return errors[0], errors[1]
 
 
 def _members(model: GyroModel) -> dict[str, str]:
@@ -152,7 +217,7 @@ def _constants(calibration: Calibration, reached: set[str]) -> list[str]:
     return lines
 
 
-def _about(calibration: Calibration) -> str:
+def _about(calibration: Calibration, rounding: tuple[float, float]) -> str:
     """The comment that opens the file."""
     model = calibration.model
     lines = [f"Rate of a gyro from its output, written by gyromodel {__version__}.", ""]
@@ -162,6 +227,10 @@ def _about(calibration: Calibration) -> str:
     lines += [
         f"Calibrated from {low:.6g} to {high:.6g} {unit} of {name}."
         for name, (low, high, unit) in validity(calibration).items()
+    ]
+    lines += [
+        f"Samples and constants in single precision make errors of {np.rad2deg(rounding[0]):.2g} deg/s at most,",
+        f"in 32-bit fixed point, each with its own binary point, of {np.rad2deg(rounding[1]):.2g} deg/s.",
     ]
     if calibration.data_hash:
         lines.append(f"SHA-256 of the calibration's data: {calibration.data_hash}")

@@ -79,4 +79,22 @@ static inline double gyromodel_rate(const gyromodel_sample *x)
     return NAN;
 }
 
+/* How many of some samples with known rates are not given back: zero. */
+static inline int gyromodel_self_test(void)
+{
+    static const struct {
+        gyromodel_sample sample;
+        double rate;
+    } tests[] = {
+$tests
+    };
+    int failed = 0, k;
+
+    for (k = 0; k < (int)(sizeof tests / sizeof tests[0]); k++) {
+        const double error = gyromodel_rate(&tests[k].sample) - tests[k].rate;
+        failed += !(fabs(error) <= 1e-8 * (1.0 + fabs(tests[k].rate)));
+    }
+    return failed;
+}
+
 #endif

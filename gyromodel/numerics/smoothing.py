@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.interpolate import BSpline, make_smoothing_spline
-from scipy.linalg import solveh_banded
+from scipy.interpolate import CubicSpline
+from scipy.linalg import get_lapack_funcs
 from scipy.optimize import bisect
 
 # More knots than this cost time and resolve nothing of a thermal record.
@@ -26,7 +26,7 @@ LEVELS = 120
 class _Smooth(NamedTuple):
     """A smoothed record: the spline over (time − start)/unit, its penalty there, and rows averaged a knot."""
 
-    spline: BSpline
+    spline: CubicSpline
     penalty: float
     start: float
     unit: float
@@ -75,14 +75,16 @@ def _smoothed(time: np.ndarray, values: np.ndarray) -> _Smooth:
     t, v = (np.add.reduceat(x, edges) / counts for x in (time, values))
     unit = float(t[-1] - t[0]) / len(t)
     x = (t - t[0]) / unit
-    penalty = _best_penalty(x, v)
-    return _Smooth(make_smoothing_spline(x, v, lam=penalty), penalty, float(t[0]), unit, block)
+    penalty, fitted = _best_fit(x, v)
+    # The natural spline through what the smoothing spline is at its knots is the same curve.
+    return _Smooth(CubicSpline(x, fitted, bc_type="natural"), penalty, float(t[0]), unit, block)
 
 
-def _best_penalty(x: np.ndarray, y: np.ndarray) -> float:
-    """The penalty λ of Σ(y − f)² + λ∫f″² by robust cross-validation; all levels, since it can have several minima.
+def _best_fit(x: np.ndarray, y: np.ndarray) -> tuple[float, np.ndarray]:
+    """The penalty λ of Σ(y − f)² + λ∫f″² by robust cross-validation, and f at the knots.
 
-    The traces in it are those of evenly spaced knots, which pass cosines of frequency ω by 1/(1 + λ d(ω)).
+    All levels are tried, since it can have several minima. The traces in it are those of evenly spaced knots, which
+    pass cosines of frequency ω by 1/(1 + λ d(ω)).
     """
     n, h = len(x), np.diff(x)
     # Qᵀ takes differences of slopes, R f″ = Qᵀf; the bands of R and QᵀQ (Green and Silverman 1994, section 2.1).
@@ -95,7 +97,9 @@ def _best_penalty(x: np.ndarray, y: np.ndarray) -> float:
     d = 12.0 * (1.0 - cosine) ** 2 / (2.0 + cosine)
     levels = np.geomspace(0.1 / d[-1], 10.0 / d[0], LEVELS)
     passed = 1.0 / (1.0 + levels[:, None] * d)
-    curvature = np.array([solveh_banded(mass + level * bending, bend) for level in levels])
+    # LAPACK itself: what solveh_banded does around it takes twice as long.
+    (solve,) = get_lapack_funcs(("pbsv",), (bending,))
+    curvature = np.array([solve(mass + level * bending, bend)[1] for level in levels])
     # y − f = λ Q f″
     pad = np.pad(curvature, ((0, 0), (2, 2)))
     residual = levels[:, None] * (
@@ -103,4 +107,5 @@ def _best_penalty(x: np.ndarray, y: np.ndarray) -> float:
     )
     cross_validation = (residual**2).sum(axis=1) / (1.0 - passed).sum(axis=1) ** 2
     squares = ((passed**2).sum(axis=1) + 2.0) / n
-    return float(levels[np.argmin(cross_validation * (ROBUSTNESS + (1.0 - ROBUSTNESS) * squares))])
+    best = np.argmin(cross_validation * (ROBUSTNESS + (1.0 - ROBUSTNESS) * squares))
+    return float(levels[best]), y - residual[best]

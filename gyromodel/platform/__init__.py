@@ -8,12 +8,24 @@ from gyromodel.platform._acceptance import (
     PRINTED_PHASE,
     judge_gain,
     judge_phase,
+    limits_at,
 )
+from gyromodel.platform._assessment import VibrationTest, parameters, vibration_test
 from gyromodel.platform._campaign import navigate_campaign
 from gyromodel.platform._drift import residual_drift
 from gyromodel.platform._earth import EARTH_RATE, earth_rate, gravity, radii, transport_rate
 from gyromodel.platform._errors import Errors, NavigationError, navigation_error
-from gyromodel.platform._explanations import ALTERNATIVES, Alternative, Explanation, Points, explain, points, separation
+from gyromodel.platform._explanations import (
+    ALTERNATIVES,
+    Alternative,
+    Explanation,
+    Points,
+    assumed_loop,
+    explain,
+    points,
+    predicted,
+    separation,
+)
 from gyromodel.platform._gimbals import (
     GimbalErrors,
     base_angles,
@@ -27,7 +39,8 @@ from gyromodel.platform._increments import coning, integrals, sculling
 from gyromodel.platform._loop import Loop, Margins, Mount, margins, measured_response
 from gyromodel.platform._motion import GIMBALS, TABLE, BaseMotion, base_motion, is_platform
 from gyromodel.platform._navigation import Navigation, attitudes, navigate
-from gyromodel.platform._record import VibrationTest, fit_vibration, vibration_test
+from gyromodel.platform._record import VibrationRecord, fit_vibration, vibration_record
+from gyromodel.platform._responses import Response, responses
 from gyromodel.platform._sensitivity import attitude_sensitivity
 from gyromodel.platform._simulation import Axis, simulate_axis
 from gyromodel.platform._vibration import PublishedResponse, SineFit, fit_sines, published_response
@@ -55,8 +68,11 @@ __all__ = [
     "NavigationError",
     "Points",
     "PublishedResponse",
+    "Response",
     "SineFit",
+    "VibrationRecord",
     "VibrationTest",
+    "assumed_loop",
     "attitude_sensitivity",
     "attitudes",
     "base_angles",
@@ -75,19 +91,24 @@ __all__ = [
     "judge_gain",
     "judge_phase",
     "least_motion_gimbals",
+    "limits_at",
     "margins",
     "measured_response",
     "navigate",
     "navigate_campaign",
     "navigation_error",
     "nulled_gimbals",
+    "parameters",
     "points",
+    "predicted",
     "published_response",
     "radii",
     "residual_drift",
+    "responses",
     "sculling",
     "separation",
     "simulate_axis",
     "transport_rate",
+    "vibration_record",
     "vibration_test",
 ]

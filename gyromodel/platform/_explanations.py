@@ -16,15 +16,30 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from scipy.stats import chi2
 
-from gyromodel.estimate import FunctionFit, fit_function
+from gyromodel.estimate import EstimateError
+from gyromodel.numerics.least_squares import levenberg_marquardt
 from gyromodel.platform._acceptance import AXES
 from gyromodel.platform._loop import Loop, Mount, measured_response
 
-# What the causes are made of: time offset (s), friction (N m s/rad) and compliance (s²) of each axis, lag (s) of all.
-ENTRIES = (*(f"{kind} {axis}" for kind in ("offset", "friction", "compliance") for axis in AXES), "lag")
+# What the causes are made of: time offset (s), friction (N m s/rad), dry friction (N m) and compliance (s²) of each
+# axis, lag (s) of all, and the corner of the loop's integration (rad/s).
+ENTRIES = (
+    *(f"{kind} {axis}" for kind in ("offset", "friction", "dry friction", "compliance") for axis in AXES),
+    "lag",
+    "corner",
+)
 # Where fits begin; all but offsets are positive.
-SIZES = np.repeat([1e-3, 1.0, 1e-5, 1e-3], [3, 3, 3, 1])
+SIZES = np.repeat([1e-3, 1.0, 1e-2, 1e-5, 1e-3, 40.0], [3, 3, 3, 3, 1, 1])
+# Amplitude of the published test, rad.
+AMPLITUDE = np.deg2rad(0.15)
+# Rounds of a fit and of the scatter that it leaves, and the relative change that ends them.
+ROUNDS, SETTLED = 200, 1e-9
+# Relative size of a singular value of the scaled Jacobian below which the points do not determine an alternative.
+SINGULAR = 1e-9
+# A standard uncertainty this many times the larger of a parameter's value and its start is no estimate.
+RUNAWAY = 100.0
 # Loops of the published bandwidth other than the default one: with as much integration as margins of 45° allow, and
 # with two integrators.
 QUICK = {"correction": 5.0, "corner": 120.0}
@@ -34,8 +49,8 @@ DOUBLE = {"correction": 5.5, "corner": 48.0, "second_corner": 48.0}
 class Alternative(NamedTuple):
     """An explanation: which kinds of entries it has, in which loop, and what the mount's damper acts against.
 
-    kinds: of "offset" (the same for all axes), "offsets" (of each axis), "friction", "compliance" and "lag"; loop: what
-    of it differs from the default one.
+    kinds: of "offset" (the same for all axes), "offsets" (of each axis), "friction", "dry friction", "compliance",
+    "lag" and "corner" (of the integration, of all loops); loop: what of it differs from the default one.
     """
 
     kinds: tuple[str, ...]
@@ -50,8 +65,10 @@ class Alternative(NamedTuple):
             "offset": unit[:, :3].sum(1, keepdims=True),
             "offsets": unit[:, :3],
             "friction": unit[:, 3:6],
-            "compliance": unit[:, 6:9],
-            "lag": unit[:, 9:],
+            "dry friction": unit[:, 6:9],
+            "compliance": unit[:, 9:12],
+            "lag": unit[:, 12:13],
+            "corner": unit[:, 13:],
         }
         return np.concatenate([parts[kind] for kind in self.kinds], axis=1)
 
@@ -70,6 +87,11 @@ ALTERNATIVES = {
     "friction, resonance": Alternative(("friction", "compliance")),
     "friction, resonance, quick integration": Alternative(("friction", "compliance"), QUICK),
     "time offset, friction, resonance": Alternative(("offset", "friction", "compliance")),
+    "friction, integration estimated": Alternative(("friction", "corner")),
+    "time offset, friction, integration estimated": Alternative(("offset", "friction", "corner")),
+    "time offset, wet and dry friction, integration estimated": Alternative(
+        ("offset", "friction", "dry friction", "corner")
+    ),
 }
 
 
@@ -77,20 +99,26 @@ class Points(NamedTuple):
     """Under what each response was measured.
 
     axis: its number; frequency: rad/s; amplifier: K_0 over that of the loop; integrated: one where navigation
-    integrates the gyros.
+    integrates the gyros; amplitude: of the table, rad.
     """
 
     axis: Int[np.ndarray, " point"]
     frequency: Float[np.ndarray, " point"]
     amplifier: Float[np.ndarray, " point"]
     integrated: Float[np.ndarray, " point"]
+    amplitude: Float[np.ndarray, " point"]
 
 
-def points(frequencies: Float[np.ndarray, " frequency"], amplifier: float = 1.0, integrated: float = 0.0) -> Points:
+def points(
+    frequencies: Float[np.ndarray, " frequency"],
+    amplifier: float = 1.0,
+    integrated: float = 0.0,
+    amplitude: float = AMPLITUDE,
+) -> Points:
     """Every axis at some frequencies (rad/s), axis by axis."""
     axis = np.repeat(np.arange(len(AXES)), len(frequencies))
     ones = np.ones(len(axis))
-    return Points(axis, np.tile(frequencies, len(AXES)), amplifier * ones, integrated * ones)
+    return Points(axis, np.tile(frequencies, len(AXES)), amplifier * ones, integrated * ones, amplitude * ones)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +131,10 @@ class Explanation:
         std: standard uncertainty of each, zero for what was not fitted.
         scatter: of gains (dB) and phases (deg): estimated from what the fit leaves, unless it was given.
         residual: measured less explained, gains before phases.
-        criterion: Akaike's, corrected for few points; the smaller the better, and a difference of 2 is little.
+        criterion: Akaike's, where the scatter is estimated corrected for few points; the smaller the better, and a
+            difference of 2 is little.
+        sum_of_squares: of residuals over their standard deviations.
+        degrees_of_freedom: observations less parameters, those held at zero and scatters included.
     """
 
     alternative: Alternative
@@ -112,6 +143,13 @@ class Explanation:
     scatter: Float[np.ndarray, " 2"]
     residual: Float[np.ndarray, " observation"]
     criterion: float
+    sum_of_squares: float = np.nan
+    degrees_of_freedom: int = 0
+
+    @property
+    def probability(self) -> float:
+        """That known standard deviations leave a sum of squares as large as this."""
+        return float(chi2.sf(self.sum_of_squares, self.degrees_of_freedom))
 
 
 def explain(
@@ -121,8 +159,11 @@ def explain(
     phase: Float[np.ndarray, " point"],
     signed: bool = True,
     phase_std: Float[np.ndarray, " point"] | None = None,
+    gain_std: Float[np.ndarray, " point"] | None = None,
 ) -> Explanation:
-    """Fit an alternative to gains and phases whose scatter is not known: one factor for gains and one for phases.
+    """Fit an alternative to gains and phases.
+
+    Their scatter is not known, but for one factor of gains and one of phases, unless `gain_std` is given.
 
     Friction, compliance and lag that would be negative are held at zero, the most negative one first; the criterion
     counts them all the same.
@@ -133,21 +174,35 @@ def explain(
         gain: dB.
         phase: deg.
         signed: whether the phases have a sign; those of an arccos do not, nor has then the offset.
-        phase_std: standard deviations of the phases relative to each other; equal by default.
+        phase_std: standard deviations of the phases, deg; without `gain_std`, relative to each other, equal by default.
+        gain_std: of the gains, dB; both are then taken for known.
 
     Raises:
         EstimateError: the points do not determine the alternative.
     """
-    n = len(gain)
-    std = np.concatenate([np.ones(n), np.ones(n) if phase_std is None else phase_std])
-    measured, groups = np.concatenate([gain, phase]), np.repeat([0, 1], n)
-    found, columns = _physical(alternative, at, measured, signed, std, groups)
-    squares = [np.mean((found.residual / std)[groups == group] ** 2) for group in (0, 1)]
-    k = alternative.columns.shape[1] + 2
-    criterion = n * float(np.log(squares).sum()) + 2 * k + 2 * k * (k + 1) / (2 * n - k - 1)
-    spread = np.sqrt(np.diag(columns @ found.parameters.covariance @ columns.T))
-    value = columns @ found.parameters.vector
-    return Explanation(alternative, value, spread, found.scatter, found.residual, criterion)
+    n, known = len(gain), gain_std is not None
+    std = np.concatenate([np.ones(n) if x is None else x for x in (gain_std, phase_std)])
+    measured, groups = np.concatenate([gain, phase]), None if known else np.repeat([0, 1], n)
+    found = _physical(alternative, at, measured, signed, std, groups)
+    squares = np.mean((found.residual / std).reshape(2, n) ** 2, axis=1)
+    k = _tested(alternative, at).shape[1] + 2 * (not known)
+    corrected = 2 * k * (k + 1) / (2 * n - k - 1) if 2 * n > k + 1 else np.inf
+    cost = n * float(squares.sum()) if known else n * float(np.log(squares).sum()) + corrected
+    scatter = np.sqrt(np.mean(std.reshape(2, n) ** 2, axis=1)) if known else found.scatter
+    total, free = found.sum_of_squares, 2 * n - k
+    return Explanation(alternative, found.value, found.std, scatter, found.residual, cost + 2 * k, total, free)
+
+
+def predicted(found: Explanation, at: Points) -> Float[np.ndarray, "2 point"]:
+    """Gains (dB) and signed phases (deg) that a fitted explanation has at some points."""
+    entries, data = jnp.asarray(found.value), _data(found.alternative, at, True)
+    return np.asarray(_predicted(entries, data)).reshape(2, -1)
+
+
+def assumed_loop(found: Explanation) -> Loop:
+    """The loop of an explanation, with the corner of its integration where that was fitted."""
+    loop, corner = Loop(**found.alternative.loop), found.value[ENTRIES.index("corner")]
+    return eqx.tree_at(lambda x: x.corner, loop, jnp.asarray(corner)) if corner > 0 else loop
 
 
 def separation(
@@ -167,38 +222,40 @@ def separation(
     at = before if test is None else Points(*(np.concatenate(pair) for pair in zip(before, test, strict=True)))
     n = len(at.axis)
     sign = np.arange(n) >= (0 if signed else len(before.axis))
-    data = _data(truth.alternative, at, sign, np.eye(len(ENTRIES)))
-    predicted = np.asarray(_predicted(jnp.asarray(truth.value), data))
+    exact = np.asarray(_predicted(jnp.asarray(truth.value), _data(truth.alternative, at, sign)))
     std = np.repeat(truth.scatter, n)
     # Of one unknown factor, which does not change the fit: no test of whether its size is probable.
-    found, _ = _physical(rival, at, predicted, sign, std, np.zeros(2 * n, int))
+    found = _physical(rival, at, exact, sign, std, np.zeros(2 * n, int))
     return float(np.linalg.norm(found.residual / std))
 
 
 class _Data(NamedTuple):
-    """What predictions need besides the parameters."""
+    """What predictions need besides the entries."""
 
-    columns: Float[Array, "entry parameter"]
     at: Any
     signed: Float[Array, " point"]
     loop: Loop
     grounded: Float[Array, ""]
+    integrating: Float[Array, ""]
 
 
-def _data(alternative: Alternative, at: Points, signed: bool | np.ndarray, columns: np.ndarray) -> _Data:
+def _data(alternative: Alternative, at: Points, signed: bool | np.ndarray) -> _Data:
     sign = np.broadcast_to(np.asarray(signed, float), at.frequency.shape)
-    at, arrays = jax.tree.map(jnp.asarray, (at, (columns, sign, alternative.grounded)))
-    return _Data(arrays[0], at, arrays[1], Loop(**alternative.loop), arrays[2])
+    integrating = float("corner" in alternative.kinds)
+    at, arrays = jax.tree.map(jnp.asarray, (at, (sign, alternative.grounded, integrating)))
+    return _Data(at, arrays[0], Loop(**alternative.loop), *arrays[1:])
 
 
-def _predict(parameters: Array, data: _Data) -> Array:
+def _predict(entry: Array, data: _Data) -> Array:
     """Gains and then phases."""
-    entry = data.columns @ parameters
+    corner = jnp.where(data.integrating > 0, entry[13], data.loop.corner)
 
-    def one(axis, frequency, amplifier, integrated):
-        changed = entry[3:6][axis], amplifier * data.loop.amplifier
-        loop = eqx.tree_at(lambda x: (x.friction, x.amplifier), data.loop, changed)
-        mount = Mount(entry[:3][axis], entry[6:9][axis], entry[9], data.grounded)
+    def one(axis, frequency, amplifier, integrated, amplitude):
+        # Of the torque M sign(ω) of a body that slides, the part that goes with the rate is 4M/(π ω̂).
+        friction = entry[3:6][axis] + 4 / jnp.pi * entry[6:9][axis] / (frequency * amplitude)
+        changed = friction, amplifier * data.loop.amplifier, corner
+        loop = eqx.tree_at(lambda x: (x.friction, x.amplifier, x.corner), data.loop, changed)
+        mount = Mount(entry[:3][axis], entry[9:12][axis], entry[12], data.grounded)
         return measured_response(loop, mount, frequency[None], integrated)[0]
 
     response = jax.vmap(one)(*data.at)
@@ -210,23 +267,85 @@ def _predict(parameters: Array, data: _Data) -> Array:
 _predicted = jax.jit(_predict)
 
 
+@jax.jit
+def _linearised(entry: Array, data: _Data) -> tuple[Array, Array]:
+    """Predictions and their derivatives by all entries, so that one program serves every alternative."""
+    return _predict(entry, data), jax.jacfwd(_predict)(entry, data)
+
+
+def _tested(alternative: Alternative, at: Points) -> np.ndarray:
+    """The columns that axes of the test have a part in."""
+    seen = np.concatenate([np.tile(np.isin(range(len(AXES)), at.axis), 4), [True, True]])
+    columns = alternative.columns
+    return columns[:, columns[seen].any(axis=0)]
+
+
+class _Fit(NamedTuple):
+    value: Float[np.ndarray, " entry"]
+    std: Float[np.ndarray, " entry"]
+    scatter: Float[np.ndarray, " group"]
+    residual: Float[np.ndarray, " observation"]
+    sum_of_squares: float
+
+
 def _physical(
     alternative: Alternative,
     at: Points,
     measured: np.ndarray,
     signed: bool | np.ndarray,
     std: np.ndarray,
-    groups: np.ndarray,
-) -> tuple[FunctionFit, np.ndarray]:
-    """The fit, and the columns that are left when no entry but an offset is negative."""
-    columns = alternative.columns
-    names = ("gains", "phases") if groups.any() else "vibration test"
+    groups: np.ndarray | None,
+) -> _Fit:
+    """The fit in which no entry but an offset is negative."""
+    columns, data = _tested(alternative, at), _data(alternative, at, signed)
     while True:
-        start = (columns / columns.sum(0)).T @ SIZES
-        found = fit_function(
-            _predict, start, measured, _data(alternative, at, signed, columns), std=std, groups=groups, name=names
-        )
-        relative = np.where(columns[:3].any(0), np.inf, found.parameters.vector / start)
-        if relative.min() >= 0:
-            return found, columns
+        found = _fitted(columns, data, measured, std, groups)
+        size = columns.T @ SIZES
+        relative = np.where(columns[:3].any(0), np.inf, columns.T @ found.value / size)
+        if relative.min(initial=np.inf) >= 0:
+            return found
         columns = np.delete(columns, relative.argmin(), axis=1)
+
+
+def _fitted(columns: np.ndarray, data: _Data, measured: np.ndarray, std: np.ndarray, groups: np.ndarray | None) -> _Fit:
+    """Least squares; groups, where given, have unknown factors of their standard deviations."""
+    known = groups is None
+    groups = np.zeros(len(measured), int) if groups is None else groups
+    counts = columns.sum(0)
+
+    def linearised(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        predicted, jacobian = _linearised(jnp.asarray(columns @ x), data)
+        return measured - np.asarray(predicted), np.asarray(jacobian) @ columns
+
+    def normal(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        residual, jacobian = linearised(x)
+        residual, jacobian = residual * weight, jacobian * weight[:, None]
+        return jacobian.T @ jacobian, -jacobian.T @ residual, float(residual @ residual)
+
+    x, scatter = columns.T @ SIZES / counts, np.ones(groups.max() + 1)
+    for _ in range(ROUNDS):
+        weight = 1 / (std * scatter[groups])
+        if len(x):
+            x = levenberg_marquardt(normal, x, 1e-13, ROUNDS).x
+        residual, jacobian = linearised(x)
+        jacobian = jacobian * weight[:, None]
+        norm = np.linalg.norm(jacobian, axis=0)
+        left, singular, right = np.linalg.svd(jacobian / np.where(norm > 0, norm, 1.0), full_matrices=False)
+        if not np.isfinite(residual).all() or singular.min(initial=1.0) < SINGULAR or not (norm > 0).all():
+            raise EstimateError("the points of the vibration test do not determine this explanation")
+        # What the fit takes of each group (Förstner 1979).
+        freedom = np.bincount(groups, 1 - np.sum(left**2, axis=1))
+        if known:
+            break
+        if freedom.min() < 1e-6:
+            raise EstimateError("the points of the vibration test are as few as the parameters of this explanation")
+        before, scatter = scatter, np.sqrt(np.bincount(groups, (residual / std) ** 2) / freedom)
+        scatter = np.maximum(scatter, 1e-12)
+        if np.all(np.abs(scatter - before) < SETTLED * before):
+            break
+    spread = (right.T / singular) / norm[:, None]
+    if (np.linalg.norm(spread, axis=1) > RUNAWAY * np.maximum(np.abs(x), columns.T @ SIZES / counts)).any():
+        raise EstimateError("the points of the vibration test do not determine this explanation")
+    spread = columns @ spread
+    squares = float(np.sum((residual / (std * scatter[groups])) ** 2))
+    return _Fit(columns @ x, np.linalg.norm(spread, axis=1), scatter, residual, squares)

@@ -36,7 +36,7 @@ SEEN, UNLIKE = 50.0, 0.05
 PAUSE = 1.0
 
 
-class VibrationTest(NamedTuple):
+class VibrationRecord(NamedTuple):
     """What a log says, ready to be searched.
 
     record: the angles; campaign: its rows as reports show them; findings: what was done to the log, in sentences.
@@ -57,10 +57,10 @@ def fit_vibration(campaigns: Campaign | Sequence[Campaign], model: GyroModel) ->
     Raises:
         CampaignError, ModelError, EstimateError: the data or the model cannot answer; the message says why.
     """
-    return with_noise_intervals(fit_record(vibration_test(campaigns).record, model))
+    return with_noise_intervals(fit_record(vibration_record(campaigns).record, model))
 
 
-def vibration_test(campaigns: Campaign | Sequence[Campaign]) -> VibrationTest:
+def vibration_record(campaigns: Campaign | Sequence[Campaign]) -> VibrationRecord:
     """Read logs of vibration tests of one platform.
 
     Args:
@@ -106,7 +106,7 @@ def vibration_test(campaigns: Campaign | Sequence[Campaign]) -> VibrationTest:
     units = {"time": "s", "table": "deg", "table_rate": "deg/s"} | dict.fromkeys(GIMBALS, "deg")
     record = laid_out(columns, blocks, scheme, "rad", units)
     record = record._replace(interval=interval, data_hash="+".join(c.digest() for c in campaigns))
-    return VibrationTest(record, _shown(campaigns[0], columns, np.concatenate(numbers)), tuple(findings))
+    return VibrationRecord(record, _shown(campaigns[0], columns, np.concatenate(numbers)), tuple(findings))
 
 
 class _Run(NamedTuple):

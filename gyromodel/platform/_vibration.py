@@ -53,7 +53,7 @@ def published_response(
     """
     a, b = (jnp.sqrt(2 * (jnp.mean(x**2, -1) - v)) for x, v in ((base, base_variance), (table, table_variance)))
     cosine = 2 * jnp.mean(base * table, -1) / (a * b)
-    phase = jnp.where(cosine <= 1 + ROUNDING, jnp.arccos(jnp.clip(cosine, -1.0, 1.0)), jnp.nan)
+    phase = jnp.where(jnp.abs(cosine) <= 1 + ROUNDING, jnp.arccos(jnp.clip(cosine, -1.0, 1.0)), jnp.nan)
     return PublishedResponse(DECIBELS * jnp.log(a / b), jnp.rad2deg(phase))
 
 
@@ -186,12 +186,16 @@ def _orthonormal(columns: jax.Array) -> tuple[jax.Array, jax.Array]:
 
     Not by LAPACK, whose calls in a compiled loop over many records waited for one another for ever on two cores.
     """
-    q, t = columns[:, :0], jnp.zeros((columns.shape[1], 0))
-    for column, own in zip(columns.T, jnp.eye(columns.shape[1]), strict=True):
+    own = jnp.eye(columns.shape[1])
+
+    # A loop, as columns written out one by one take seconds to compile.
+    def add(k, found):
+        q, t = found
+        column, mine = columns[:, k], own[:, k]
         for _ in range(2):
             along = q.T @ column
-            column, own = column - q @ along, own - t @ along
+            column, mine = column - q @ along, mine - t @ along
         norm = jnp.sqrt(column @ column)
-        q = jnp.concatenate([q, (column / norm)[:, None]], axis=1)
-        t = jnp.concatenate([t, (own / norm)[:, None]], axis=1)
-    return q, t
+        return q.at[:, k].set(column / norm), t.at[:, k].set(mine / norm)
+
+    return jax.lax.fori_loop(0, len(own), add, (jnp.zeros_like(columns), jnp.zeros_like(own)))

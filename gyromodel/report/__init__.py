@@ -9,6 +9,7 @@ from gyromodel.report._sentence import sentence
 
 if TYPE_CHECKING:
     from gyromodel.report._deviation import deviation_figure, noise_rows
+    from gyromodel.report._vibration import vibration_figures, vibration_words
 
 __all__ = [
     "deviation_figure",
@@ -16,6 +17,8 @@ __all__ = [
     "noise_rows",
     "parted_words",
     "sentence",
+    "vibration_figures",
+    "vibration_words",
     "with_uncertainty",
     "write_report",
 ]
@@ -23,8 +26,10 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """What needs NumPy and JAX is imported when it is used: a sentence does not."""
-    if name not in ("deviation_figure", "noise_rows"):
+    if name in ("deviation_figure", "noise_rows"):
+        from gyromodel.report import _deviation as module
+    elif name in ("vibration_figures", "vibration_words"):
+        from gyromodel.report import _vibration as module
+    else:
         raise AttributeError(f"module 'gyromodel.report' has no attribute {name!r}")
-    from gyromodel.report import _deviation
-
-    return getattr(_deviation, name)
+    return getattr(module, name)

@@ -1,0 +1,166 @@
+"""The one table of an archive's results, written in atomic parts so that nothing finished is ever lost or repeated."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import pyarrow as pa
+from pyarrow import parquet
+
+from gyromodel._checks import CampaignError
+from gyromodel.batch._archive import Entry
+
+SCHEMA = pa.schema(
+    [(name, pa.string()) for name in ("campaign", "axis", "parameter")]
+    + [(name, pa.float64()) for name in ("value", "std", "low", "high")]
+    + [(name, pa.string()) for name in ("unit", "status", "reason", "verdict", "causes")]
+    + [("gain_ratio", pa.float64()), ("samples", pa.int64()), ("iterations", pa.int64())]
+    + [(name, pa.string()) for name in ("serial", "date", "data_hash", "model_hash", "version", "file_state")]
+)
+# Seconds of finished work that a kill may cost.
+PART_EVERY = 1.0
+# Under this key the table says what made it.
+MADE_BY = b"gyromodel"
+
+
+class Results:
+    """What is finished of an archive: an earlier table, and parts written since.
+
+    Use as a context manager, which keeps other runs away from the same table.
+
+    Args:
+        path: of the table.
+        made_by: what determines the results besides the data, such as hashes; a table made otherwise is refused.
+
+    Raises:
+        CampaignError: the table is something else, was made otherwise, or is being written by another run.
+    """
+
+    def __init__(self, path: Path, made_by: Mapping[str, str]) -> None:
+        self.path, self.made_by = path, dict(made_by)
+        self._folder = path.with_name(f".{path.name}.parts")
+        self._tables: list[pa.Table] = []
+        self._waiting: list[dict[str, Any]] = []
+        self._written = 0.0
+
+    def __enter__(self) -> Self:
+        if self.path.exists():
+            self._tables.append(self._read(self.path))
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._lock = open(self._folder / "lock", "w")
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self._lock.close()
+            raise CampaignError(f"{self.path}: another run is writing it") from None
+        for part in sorted(self._folder.glob("*.parquet")):
+            try:
+                self._tables.append(self._read(part))
+            except CampaignError:
+                if self._made_otherwise(part):
+                    self._lock.close()
+                    raise
+                part.unlink()  # cut short with the machine
+        self._next = 1 + max((int(part.stem) for part in self._folder.glob("*.parquet")), default=0)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None):
+        """Keep what is finished, whatever ended the run."""
+        try:
+            self.flush()
+        finally:
+            self._lock.close()
+
+    def finished(self) -> dict[str, str]:
+        """The state in which each campaign was examined, by its name."""
+        states: dict[str, str] = {}
+        for table in self._tables:
+            states |= zip(table["campaign"].to_pylist(), table["file_state"].to_pylist(), strict=True)
+        return states
+
+    def add(self, rows: Iterable[dict[str, Any]]) -> None:
+        """Take the rows of one campaign; they are on disk a moment later."""
+        self._waiting += rows
+        if time.monotonic() - self._written > PART_EVERY:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what waits as a part."""
+        if self._waiting:
+            table = self._table(self._waiting)
+            write_table(table, self._folder / f"{self._next:08d}.parquet")
+            self._tables.append(table)
+            self._waiting, self._next = [], self._next + 1
+        self._written = time.monotonic()
+
+    def merge(self, order: Sequence[Entry]) -> pa.Table:
+        """Write the table: each campaign of the archive once, in its order, as it was examined last."""
+        self.flush()
+        place = {entry.campaign: i for i, entry in enumerate(order)}
+        # The last table that has a campaign counts.
+        source = {name: i for i, table in enumerate(self._tables) for name in table["campaign"].unique().to_pylist()}
+        kept = []
+        for i, table in enumerate(self._tables):
+            names = table["campaign"].to_pylist()
+            rows = [k for k, name in enumerate(names) if source[name] == i and name in place]
+            kept.append(table.take(rows).append_column("_place", pa.array([place[names[k]] for k in rows], pa.int64())))
+        # The sort keeps equal ones as they are: parameters stay in the order of the model.
+        whole = pa.concat_tables(kept)
+        order_of = sorted(range(len(whole)), key=whole["_place"].to_pylist().__getitem__)
+        whole = whole.take(order_of).drop_columns(["_place"])
+        write_table(whole, self.path)
+        shutil.rmtree(self._folder)
+        return whole
+
+    def _table(self, rows: list[dict[str, Any]]) -> pa.Table:
+        return pa.Table.from_pylist(rows, SCHEMA).replace_schema_metadata({MADE_BY: json.dumps(self.made_by)})
+
+    def _read(self, path: Path) -> pa.Table:
+        table = read_results(path)
+        if (made_by := json.loads(table.schema.metadata[MADE_BY])) != self.made_by:
+            other = " and ".join(sorted(k for k in self.made_by if made_by.get(k) != self.made_by[k]))
+            raise CampaignError(f"{path}: holds results of another {other}: name another file, or remove this one")
+        return table
+
+    def _made_otherwise(self, part: Path) -> bool:
+        try:
+            return MADE_BY in (parquet.read_schema(part).metadata or {})
+        except (pa.ArrowException, OSError):
+            return False
+
+
+def read_results(path: Path) -> pa.Table:
+    """A table of results.
+
+    Raises:
+        CampaignError: it is none.
+    """
+    try:
+        with parquet.ParquetFile(path) as file:
+            table = file.read()
+    except (pa.ArrowException, OSError) as error:
+        raise CampaignError(f"{path}: is no table of results, or cannot be read") from error
+    if MADE_BY not in (table.schema.metadata or {}):
+        raise CampaignError(f"{path}: is no table of results")
+    return table
+
+
+def write_table(table: pa.Table, path: Path) -> None:
+    """Whole or not at all, and on disk."""
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        with open(temporary, "wb") as file:
+            parquet.write_table(table, file, compression="zstd")
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

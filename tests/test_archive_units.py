@@ -1,0 +1,122 @@
+"""Statistics of an archive's units on drawn archives: intervals cover, false alarms are as rare as stated."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from scipy.stats import binom
+
+from gyromodel.batch import Parameter, pooled_table, unit_statistics
+
+
+def drawn(
+    rng: np.random.Generator, units: int, campaigns: int, between: float, within: float, shift: float = 0.0,
+    drift: float = 0.0,
+) -> tuple[pa.Table, np.ndarray]:  # fmt: skip
+    """Results of an archive and the true values; unit 0 is off by `shift` and changes by `drift` a campaign."""
+    unit = np.repeat(np.arange(units), campaigns)
+    number = np.tile(np.arange(campaigns), units)
+    std = 10 ** rng.uniform(-0.5, 0.5, len(unit))
+    true = 40 + between * rng.standard_normal(units)[unit] + within * rng.standard_normal(len(unit))
+    true = true + (unit == 0) * (shift + drift * number)
+    value = true + std * rng.standard_normal(len(unit))
+    n = len(unit)
+    table = {
+        "campaign": [f"c{i}" for i in range(n)], "axis": [None] * n, "parameter": ["bias.value"] * n,
+        "value": value, "std": std, "unit": ["deg/h"] * n, "serial": [f"U{u}" for u in unit], "date": [None] * n,
+        "status": ["fitted"] * n,
+    }  # fmt: skip
+    return pa.table(table, pa.schema([("campaign", pa.string()), ("axis", pa.string()), ("parameter", pa.string()),
+        ("value", pa.float64()), ("std", pa.float64()), ("unit", pa.string()), ("serial", pa.string()),
+        ("date", pa.string()), ("status", pa.string())])), true  # fmt: skip
+
+
+def statistics(table: pa.Table) -> Parameter:
+    [found] = unit_statistics(table)
+    return found
+
+
+def within_binomial(count: int, total: int, level: float) -> bool:
+    """Whether a count is one that the level would give in 999 of 1000 cases, on either side."""
+    return bool(binom.ppf(5e-4, total, level) <= count <= binom.ppf(1 - 5e-4, total, level))
+
+
+@pytest.mark.parametrize(("units", "campaigns"), [(12, 1), (6, 4), (20, 3)])
+def test_intervals_cover_whatever_the_spreads_are(units: int, campaigns: int, seed: int):
+    """One campaign of each archive, as those of one archive err together; a uniform prior errs on the wide side."""
+    rng = np.random.default_rng(seed)
+    archives, covered, spread, closer = 120, 0, 0, []
+    for _ in range(archives):
+        between, within = rng.choice([0.1, 1.0, 5.0]), rng.choice([0.0, 0.5])
+        table, true = drawn(rng, units, campaigns, between, within)
+        found = statistics(table)
+        true, std = true[found.pooled["row"]], table["std"].to_numpy()[found.pooled["row"]]
+        k = rng.integers(len(true))
+        covered += bool(found.pooled["low"][k] <= true[k] <= found.pooled["high"][k])
+        spread += bool(found.between.low <= between <= found.between.high)
+        closer.append(np.mean(found.pooled["std"] / std))
+    assert covered >= binom.ppf(1e-3, archives, 0.95), f"seed {seed}: {covered} of {archives}"
+    if (units, campaigns) != (12, 1):
+        assert spread >= binom.ppf(1e-3, archives, 0.93), f"seed {seed}: {spread} of {archives}"
+    assert np.mean(closer) < 0.9, "pooling helps nobody"
+
+
+def test_short_campaigns_gain_most_where_units_are_alike(seed: int):
+    table, true = drawn(np.random.default_rng(seed), 40, 1, 0.2, 0.0)
+    found = statistics(table)
+    order = found.pooled["row"]
+    std, value, true = table["std"].to_numpy()[order], table["value"].to_numpy()[order], true[order]
+    assert np.median((found.pooled["std"] / std)[std > 1]) < 0.4
+    raw, pooled = (np.sqrt(np.mean((x - true) ** 2)) for x in (value, found.pooled["value"]))
+    assert pooled < 0.5 * raw
+
+
+def test_nothing_stands_out_but_by_chance(seed: int):
+    rng, archives = np.random.default_rng(seed), 120
+    alarms = np.zeros(2, int)
+    for _ in range(archives):
+        found = statistics(drawn(rng, 8, 4, rng.choice([0.3, 3.0]), rng.choice([0.0, 1.0]))[0])
+        alarms += [bool(found.outliers), bool(found.drifts)]
+    assert alarms.max() <= binom.ppf(0.999, archives, 0.01), f"seed {seed}: {alarms} of {archives}"
+
+
+def test_a_unit_that_is_off_and_one_that_drifts_are_named(seed: int):
+    rng = np.random.default_rng(seed)
+    found = statistics(drawn(rng, 15, 4, 1.0, 0.3, shift=12.0)[0])
+    assert [o.unit for o in found.outliers] == ["U0"]
+    assert abs(found.outliers[0].deviations) > 3.5
+    found = statistics(drawn(rng, 8, 8, 1.0, 0.0, drift=3.0)[0])
+    assert [d.unit for d in found.drifts] == ["U0"]
+    assert abs(found.drifts[0].rate - 3.0) < 4 * found.drifts[0].std
+    assert "per campaign" in "".join(found.sentences())
+
+
+def test_dates_give_drifts_per_day(seed: int):
+    table, _ = drawn(np.random.default_rng(seed), 4, 6, 1.0, 0.0, drift=5.0)
+    dates = pa.array([f"2026-{1 + i % 6:02d}-01" for i in range(24)])
+    table = table.set_column(table.column_names.index("date"), "date", dates)
+    [drift] = statistics(table).drifts
+    assert (drift.unit, drift.per) == ("U0", "day")
+    assert abs(drift.rate - 5 / 30.2) < 4 * drift.std + 0.01
+
+
+def test_units_of_measure_change_nothing_and_failures_are_left_out(seed: int):
+    table, _ = drawn(np.random.default_rng(seed), 6, 2, 1.0, 0.5)
+    first = statistics(table)
+    for name in ("value", "std"):
+        table = table.set_column(table.column_names.index(name), name, pa.array(table[name].to_numpy() / 3600))
+    lost = table.slice(0, 1).set_column(table.column_names.index("status"), "status", pa.array(["failed"]))
+    table = pa.concat_tables([table, lost])
+    second = statistics(table)
+    assert second.campaigns == 12
+    assert (second.mean * 3600, second.between.value * 3600) == pytest.approx((first.mean, first.between.value))
+    pooled = pooled_table(table, [second])
+    assert pooled["pooled_value"].to_numpy() * 3600 == pytest.approx(
+        first.pooled["value"][np.argsort(first.pooled["row"])]
+    )
+    assert pooled["campaign"].to_pylist() == [f"c{i}" for i in range(12)]
+
+
+def test_one_unit_says_nothing_of_units(seed: int):
+    assert unit_statistics(drawn(np.random.default_rng(seed), 1, 3, 1.0, 0.0)[0]) == []

@@ -1,0 +1,260 @@
+"""An archive into one table: each campaign as `fit` has it, once, whatever kills the run or its workers."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pyarrow as pa
+import pytest
+from pyarrow import parquet
+
+from gyromodel import CampaignError, cli
+from gyromodel.batch import Entry, entries, run_batch
+from gyromodel.batch import _results as storage
+from gyromodel.campaign import Campaign
+from gyromodel.estimate import fit
+from gyromodel.files import write_campaign
+from gyromodel.model_files import read_model
+
+MODEL = "effects: [{effect: bias}, {effect: bias_temperature}]\n"
+# Of two lengths, so that few shapes are compiled.
+LENGTHS = (60, 64)
+
+
+def campaign(k: int, **metadata: str) -> Campaign:
+    rng, rows = np.random.default_rng(k), LENGTHS[k % 2]
+    time = 10.0 * np.arange(rows)
+    temperature = 20 + 10 * np.sin(time / 90)
+    output = 3 + 0.2 * (temperature - 20) + 0.05 * rng.standard_normal(rows)
+    columns = {"time": time, "temperature": temperature, "output": output}
+    units = {"time": "s", "temperature": "degC", "output": "deg/h"}
+    return Campaign(columns, units, {"kind": "rate", "serial": f"U{k % 3}", **metadata})
+
+
+def archive(folder: Path, count: int) -> Path:
+    """Half of the campaigns in a folder below."""
+    for k in range(count):
+        place = folder / "archive" / ("below" if k % 2 else ".")
+        place.mkdir(parents=True, exist_ok=True)
+        write_campaign(campaign(k), place / f"c{k:03d}.csv")
+    (folder / "model.yaml").write_text(MODEL)
+    return folder / "archive"
+
+
+def batch(folder: Path, *more: str, results: str = "results.parquet") -> tuple[int, dict[str, object]]:
+    """Exit status and printed result of the command."""
+    command = ["batch", str(folder / "archive"), "--model", str(folder / "model.yaml"), "-o", str(folder / results)]
+    done = subprocess.run(
+        [sys.executable, "-m", "gyromodel", *command, "--json", *more], capture_output=True, text=True, check=False
+    )
+    assert "Traceback" not in done.stderr, done.stderr
+    return done.returncode, json.loads(done.stdout) if done.stdout else {"said": done.stderr}
+
+
+def table(folder: Path, results: str = "results.parquet") -> list[dict[str, object]]:
+    return parquet.read_table(folder / results).to_pylist()
+
+
+def here(folder: Path, name: str = "results.parquet", where: Path | None = None):
+    return run_batch(str(where or folder / "archive"), read_model(folder / "model.yaml"), "m", folder / name)
+
+
+def test_every_row_is_what_fit_finds(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    place = archive(tmp_path, 3)
+    (place / "bad.csv").write_text("time [s],output [deg/h]\n0,1\n")
+    with pytest.raises(SystemExit) as done:
+        cli.main(["batch", str(place), "--model", str(tmp_path / "model.yaml"), "-o", str(tmp_path / "r.parquet")])
+    assert done.value.code == 1
+    said = capsys.readouterr()
+    assert "1 of 4 campaigns failed" in said.err
+    assert "4 campaigns, 4 examined" in said.out
+    rows = table(tmp_path, "r.parquet")
+    assert [row["campaign"] for row in rows if row["status"] == "failed"] == ["bad.csv"]
+    assert "at least 3" in rows[0]["reason"]
+    assert list(dict.fromkeys(r["campaign"] for r in rows)) == ["bad.csv", "below/c001.csv", "c000.csv", "c002.csv"]
+    estimate = fit(campaign(0), read_model(tmp_path / "model.yaml"))
+    mine = {row["parameter"]: row for row in rows if row["campaign"] == "c000.csv"}
+    for row in estimate.table():
+        stored = mine[f"{row.effect}.{row.name}"]
+        assert (stored["value"], stored["std"], stored["unit"]) == (row.value, row.std, row.unit)
+        assert stored["data_hash"] == campaign(0).digest()
+        assert stored["model_hash"] == sha256(MODEL.encode()).hexdigest()
+        assert stored["serial"] == "U0"
+    assert mine["noise_white"]["low"] < mine["noise_white"]["value"] < mine["noise_white"]["high"]
+
+
+def test_a_killed_run_goes_on_where_it_was(tmp_path: Path):
+    archive(tmp_path, 40)
+    whole = here(tmp_path, "whole.parquet").table
+    command = [sys.executable, "-m", "gyromodel", "batch", str(tmp_path / "archive")]
+    options = ["--model", str(tmp_path / "model.yaml"), "-o", str(tmp_path / "results.parquet")]
+    running = subprocess.Popen([*command, *options])
+    parts = tmp_path / ".results.parquet.parts"
+    while running.poll() is None and not list(parts.glob("*.parquet")):
+        time.sleep(0.02)
+    running.send_signal(signal.SIGKILL)
+    assert running.wait() == -signal.SIGKILL
+    assert not (tmp_path / "results.parquet").exists()
+    finished = {row["campaign"] for part in parts.glob("*.parquet") for row in parquet.read_table(part).to_pylist()}
+    assert finished
+    (parts / "99999999.parquet").write_bytes(b"PAR1 cut short with the machine")
+
+    status, result = batch(tmp_path)
+    assert status == 0
+    assert result["examined"] == 40 - len(finished)
+    again = parquet.read_table(tmp_path / "results.parquet")
+    model_hash = again.column_names.index("model_hash")
+    assert again.remove_column(model_hash).equals(whole.remove_column(model_hash))
+    assert not parts.exists()
+
+
+def test_what_has_changed_is_examined_again(tmp_path: Path):
+    place = archive(tmp_path, 4)
+    assert here(tmp_path).examined == 4
+    assert here(tmp_path).examined == 0
+    write_campaign(campaign(7), place / "c000.csv")
+    (place / "c002.csv").unlink()
+    write_campaign(campaign(4), place / "new.csv")
+    done = here(tmp_path)
+    assert (done.campaigns, done.examined, done.failed) == (4, 2, 0)
+    hashes = {row["campaign"]: row["data_hash"] for row in done.table.to_pylist()}
+    assert hashes == {
+        "below/c001.csv": campaign(1).digest(),
+        "below/c003.csv": campaign(3).digest(),
+        "c000.csv": campaign(7).digest(),
+        "new.csv": campaign(4).digest(),
+    }
+
+
+def test_results_made_otherwise_are_kept(tmp_path: Path):
+    archive(tmp_path, 1)
+    here(tmp_path)
+    before = (tmp_path / "results.parquet").read_bytes()
+    start = read_model(tmp_path / "model.yaml")
+    with pytest.raises(CampaignError, match="of another model: name another file"):
+        run_batch(str(tmp_path / "archive"), start, "other", tmp_path / "results.parquet")
+    with pytest.raises(CampaignError, match="of another task"):
+        run_batch(str(tmp_path / "archive"), start, "m", tmp_path / "results.parquet", diagnosing=True)
+    other = tmp_path / "archive" / "below"
+    other.mkdir(exist_ok=True)
+    write_campaign(campaign(9), other / "c.csv")
+    with pytest.raises(CampaignError, match="of another archive"):
+        here(tmp_path, where=other)
+    assert (tmp_path / "results.parquet").read_bytes() == before
+    foreign = tmp_path / "foreign.parquet"
+    parquet.write_table(pa.table({"a": [1]}), foreign)
+    with pytest.raises(CampaignError, match="is no table of results"):
+        here(tmp_path, "foreign.parquet")
+    assert parquet.read_table(foreign).to_pylist() == [{"a": 1}]
+
+
+def test_two_runs_do_not_write_one_table(tmp_path: Path):
+    archive(tmp_path, 1)
+    made_by = {"archive": "a", "model": "m"}
+    with storage.Results(tmp_path / "results.parquet", made_by), pytest.raises(CampaignError, match="another run"):
+        storage.Results(tmp_path / "results.parquet", made_by).__enter__()
+
+
+def test_a_full_disk_leaves_what_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    archive(tmp_path, 3)
+    done = here(tmp_path)
+    write_campaign(campaign(8), tmp_path / "archive" / "new.csv")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(storage.os, "fsync", full)
+        with pytest.raises(OSError, match="No space"):
+            here(tmp_path)
+    assert parquet.read_table(tmp_path / "results.parquet").equals(done.table)
+    assert not list(tmp_path.rglob("*.tmp"))
+    assert here(tmp_path).campaigns == 4
+
+
+@pytest.mark.long
+def test_a_worker_that_dies_loses_nothing(tmp_path: Path):
+    """Of a local cluster of two processes, one is killed when the first results are there."""
+    archive(tmp_path, 24)
+    command = [sys.executable, "-m", "gyromodel", "batch", str(tmp_path / "archive"), "--workers", "2", "--json"]
+    options = ["--model", str(tmp_path / "model.yaml"), "-o", str(tmp_path / "results.parquet")]
+    running = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    parts = tmp_path / ".results.parquet.parts"
+    while running.poll() is None and not list(parts.glob("*.parquet")):
+        time.sleep(0.02)
+    workers = [p for p in psutil.Process(running.pid).children(recursive=True) if "spawn_main" in " ".join(p.cmdline())]
+    assert len(workers) == 2
+    workers[0].kill()
+    out, said = running.communicate(timeout=120)
+    assert running.returncode == 0, said
+    assert json.loads(out)["campaigns"] == 24
+    rows = table(tmp_path)
+    assert {row["status"] for row in rows} == {"fitted"}
+    assert len({(row["campaign"], row["parameter"]) for row in rows}) == len(rows) == 24 * 5
+
+
+def test_archives_of_every_kind(tmp_path: Path):
+    folder = tmp_path / "a"
+    (folder / "x" / ".hidden").mkdir(parents=True)
+    for name in ("one.csv", "x/two.csv.gz", "x/three.parquet", "x/.hidden/no.csv"):
+        write_campaign(campaign(0), folder / name)
+    (folder / "notes.txt").write_text("not a campaign")
+    write_campaign(campaign(1), folder / "group.zarr" / "unit1.zarr")
+    write_campaign(campaign(2), folder / "group.zarr" / "deep" / "unit2.zarr")
+    for group in (folder / "group.zarr", folder / "group.zarr" / "deep"):
+        (group / "zarr.json").write_text('{"zarr_format": 3, "node_type": "group", "attributes": {}}')
+    inside = ["group.zarr/deep/unit2.zarr", "group.zarr/unit1.zarr", "one.csv", "x/three.parquet", "x/two.csv.gz"]
+    assert [e.campaign for e in entries(str(folder))] == inside
+    assert [e.campaign for e in entries(str(folder / "group.zarr"))] == ["deep/unit2.zarr", "unit1.zarr"]
+    found = entries(f"{folder}/**/*.csv*")
+    assert [Path(e.path).name for e in found] == ["one.csv", "two.csv.gz"]
+    manifest = folder / "list.parquet"
+    parquet.write_table(pa.table({"campaign": ["x/two.csv.gz", "one.csv"]}), manifest)
+    assert entries(str(manifest)) == [
+        Entry("x/two.csv.gz", str(folder / "x" / "two.csv.gz")), Entry("one.csv", str(folder / "one.csv"))
+    ]  # fmt: skip
+    assert [e.campaign for e in entries(str(folder / "one.csv"))] == ["one.csv"]
+    with pytest.raises(CampaignError, match="no such folder"):
+        entries(str(tmp_path / "nothing"))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(CampaignError, match="no campaign in it"):
+        entries(str(tmp_path / "empty"))
+
+
+def test_axes_and_diagnoses(tmp_path: Path):
+    """Each axis has its rows, and a dead one its reason; with a diagnosis come verdict and gain."""
+    (tmp_path / "archive").mkdir()
+    one = campaign(0)
+    columns = {f"output_{a}": one.columns["output"] + i for i, a in enumerate("xy")} | {"output_z": np.zeros(len(one))}
+    several = one.without("output")
+    for name, values in columns.items():
+        several = several.with_column(name, values, "deg/h")
+    write_campaign(several, tmp_path / "archive" / "three.csv")
+    (tmp_path / "model.yaml").write_text("effects: [{effect: bias}]\n")
+    start = read_model(tmp_path / "model.yaml")
+    done = run_batch(str(tmp_path / "archive"), start, "m", tmp_path / "r.parquet", diagnosing=True)
+    rows = done.table.to_pylist()
+    assert done.failed == 1
+    assert {r["axis"]: r["status"] for r in rows} == {"x": "diagnosed", "y": "diagnosed", "z": "failed"}
+    told = {(r["verdict"], r["causes"]) for r in rows if r["axis"] != "z"}
+    assert told == {("named", "bias_temperature")}
+    assert all(r["gain_ratio"] > 2 for r in rows if r["axis"] != "z")
+    assert any(r["parameter"] == "bias_temperature.coefficient" for r in rows)
+
+
+@pytest.mark.long
+def test_a_scheduler_that_is_not_there_is_said(tmp_path: Path):
+    archive(tmp_path, 1)
+    status, result = batch(tmp_path, "--scheduler", "tcp://127.0.0.1:9")
+    assert status == 1
+    assert "no Dask scheduler answers" in str(result["said"])
+    assert os.listdir(tmp_path / ".results.parquet.parts") == ["lock"]

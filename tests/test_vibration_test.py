@@ -1,0 +1,238 @@
+"""A vibration test from its log to its verdict. Expected: the truth behind simulated logs, the binomial and χ² laws
+over fresh draws, `fit_sines`, and closed forms."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import binom, chi2, kstest
+
+import gyromodel
+from gyromodel import CampaignError, cli
+from gyromodel._console import print_table
+from gyromodel.campaign import Campaign
+from gyromodel.files import read_campaign, write_campaign
+from gyromodel.platform import (
+    ALTERNATIVES,
+    FREQUENCIES,
+    BaseMotion,
+    Explanation,
+    VibrationTest,
+    explain,
+    fit_sines,
+    limits_at,
+    parameters,
+    points,
+    predicted,
+    responses,
+    vibration_test,
+)
+from gyromodel.report import vibration_words, with_uncertainty
+
+LOG = Path(gyromodel.__file__).parent / "data" / "platform_vibration.csv.gz"
+SECOND = np.deg2rad(1 / 3600)
+SAMPLES, STEP, AMPLITUDE = 1000, 0.02, np.deg2rad(0.15)
+GAIN, PHASE = -0.05, -1.0
+
+
+def motion(base: np.ndarray, table: np.ndarray, time: np.ndarray | None = None) -> BaseMotion:
+    """Runs (rows of both) of one axis, the others still."""
+    runs, samples = base.shape
+    time = np.arange(samples) * STEP if time is None else time
+    still = np.zeros((base.size, 2))
+    angles = [np.column_stack([x.ravel(), still]) for x in (table, base)]
+    readings = np.column_stack([base.ravel(), np.zeros((base.size, 3))])
+    times = (time + np.arange(runs)[:, None] * (time[-1] + 1)).ravel()
+    segment = np.repeat(np.arange(runs), samples)
+    return BaseMotion(times, *angles, readings, np.zeros((base.size, 4)), np.eye(3), segment)
+
+
+def sines(w: float, rng: np.random.Generator, runs: int) -> tuple[np.ndarray, np.ndarray]:
+    angle = w * np.arange(SAMPLES) * STEP + rng.uniform(0, 2 * np.pi, (runs, 1))
+    return 10 ** (GAIN / 20) * AMPLITUDE * np.sin(angle + np.deg2rad(PHASE)), AMPLITUDE * np.sin(angle)
+
+
+def noise(kind: str, rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
+    """Of the base, rad: white; the angle of a gyro with a random walk; that of one whose rate walks."""
+    white = SECOND * rng.standard_normal(shape)
+    walk = np.sqrt(STEP) * np.cumsum(rng.standard_normal(shape), axis=1)
+    rate = 10 * SECOND * STEP * np.cumsum(walk, axis=1)
+    return white + {"white": 0.0, "walk": 5 * SECOND * walk, "rate walk": rate, "quantised": 0.0}[kind]
+
+
+@pytest.mark.parametrize("kind", ["white", "walk", "rate walk", "quantised"])
+@pytest.mark.parametrize("w", [0.5, 10.0])
+def test_intervals_hold_in_noise_of_any_colour(kind: str, w: float, rng: np.random.Generator):
+    runs = 50
+    base, table = sines(w, rng, runs)
+    base, table = base + noise(kind, rng, base.shape), table + noise("white", rng, base.shape)
+    if kind == "quantised":
+        base, table = (np.round(x / (10 * SECOND)) * 10 * SECOND for x in (base, table))
+    found, remarks = responses(motion(base, table))
+    assert len(found) == runs, remarks
+    least = binom.ppf(1e-4, runs, 0.95)
+    for name, true in (("gain", GAIN), ("phase", PHASE)):
+        ends = np.array([getattr(r, f"{name}_interval") for r in found])
+        assert np.sum((ends[:, 0] <= true) & (true <= ends[:, 1])) >= least
+        errors = np.array([getattr(r, name) for r in found]) - true
+        stated = np.array([getattr(r, f"{name}_std") for r in found])
+        # Not much wider than they need be: 1.3 times, with the rms of 50 errors as small as the χ² law allows. An
+        # encoder's steps are allowed for at their worst.
+        wide = 4.0 if kind == "quantised" else 1.3 / np.sqrt(chi2.ppf(1e-4, runs) / runs)
+        assert np.sqrt(np.mean(stated**2)) < wide * np.sqrt(np.mean(errors**2))
+
+
+def test_the_same_sines_as_at_the_known_frequency(rng: np.random.Generator):
+    base, table = (x + 1e-6 * rng.standard_normal(x.shape) for x in sines(10.0, rng, 1))
+    [found] = responses(motion(base, table))[0]
+    time = jnp.arange(SAMPLES) * STEP
+    fit = fit_sines(time, jnp.asarray(base[0]), jnp.asarray(table[0]), found.frequency, degree=3, harmonics=3)
+    assert (found.gain, found.phase) == pytest.approx((float(fit.gain), float(fit.phase)), abs=1e-9)
+    assert found.frequency == pytest.approx(10.0, abs=5 * found.frequency_std)
+    # White noise: the same standard error but for what is estimated of its colour.
+    assert found.phase_std == pytest.approx(float(fit.phase_std), rel=0.5)
+    assert found.axis == "X"
+    assert found.amplitude == pytest.approx(0.15, rel=1e-4)
+    assert found.cross == {"Y": (0.0, 0.0), "Z": (0.0, 0.0)}
+
+
+def test_times_may_be_uneven(rng: np.random.Generator):
+    time = np.sort(rng.uniform(0, 20, SAMPLES))
+    table = AMPLITUDE * np.sin(3.0 * time)[None]
+    base = AMPLITUDE * np.sin(3.0 * time - 0.01)[None]
+    [found] = responses(motion(base + 1e-9 * rng.standard_normal(base.shape), table, time))[0]
+    assert (found.frequency, found.phase) == pytest.approx((3.0, np.rad2deg(-0.01)), rel=1e-4)
+
+
+def test_limits_are_those_of_published_frequencies():
+    assert limits_at(1.005) == (0.1, -0.5)
+    assert limits_at(30.3) == (0.2, -10.0)
+    assert limits_at(15.0) is None
+
+
+@pytest.fixture(scope="module")
+def demo() -> VibrationTest:
+    return vibration_test(read_campaign(LOG))
+
+
+def test_the_embedded_log(demo: VibrationTest):
+    """Records 2 ms late; friction of X (inertia 0.45) and Z (0.56) 0.5 N m s/rad, in a loop of 220 rad/s instead of the
+    assumed 210, whose lags differ too: what they do to offset and friction is a part in 200, and in seven."""
+    assert [(r.axis, round(r.frequency)) for r in demo.responses] == [(a, w) for a in "XYZ" for w in (1, 10, 20, 30)]
+    assert not demo.remarks
+    assert all(r.verdicts[0] == "pass" for r in demo.responses)
+    best = demo.supported[0]
+    assert best == "time offset, wet and dry friction, integration estimated"
+    values = {row.name: row.value for row in parameters(demo.explanations[best])}
+    assert values["time offset"] == pytest.approx(2.0, abs=0.02)
+    assert values["friction over inertia X"] == pytest.approx(0.5 / 0.45 * 210 / 220, rel=0.25)
+    assert values["friction over inertia Z"] == pytest.approx(0.5 / 0.56 * 210 / 220, rel=0.25)
+    assert values["corner"] == pytest.approx(30.0, rel=0.25)
+
+
+def test_the_readme_prints_what_the_command_does(demo: VibrationTest, capsys: pytest.CaptureFixture[str]):
+    readme = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
+    words = vibration_words(demo)
+    print_table(words.head, words.runs)
+    assert "\n".join(capsys.readouterr().out.splitlines()[:5]) in readme
+    rows = {row.name: row for row in parameters(demo.explanations[demo.supported[0]])}
+    for name in ("time offset", "friction over inertia X", "friction over inertia Z"):
+        assert with_uncertainty(rows[name].value, rows[name].std, rows[name].unit) in readme
+
+
+def test_one_axis_at_two_frequencies_tells_less():
+    """Untested axes have no numbers; the explanations that are left are set apart by the test that is named."""
+    log = read_campaign(LOG)
+    found = vibration_test(log.select(log.columns["segment"] == 3))
+    assert len(found.responses) == 1
+    found = vibration_test(log.select(np.isin(log.columns["segment"], [3, 4])))
+    assert {r.axis for r in found.responses} == {"X"}
+    names = {row.name for e in found.explanations.values() for row in parameters(e)}
+    assert "friction over inertia X" in names
+    assert not any(name.endswith(("Y", "Z")) for name in names)
+    assert all(e.degrees_of_freedom > 0 for e in found.explanations.values())
+    assert len(found.supported) > 1
+    assert found.next_test is not None
+    assert found.further[found.next_test] > 3.3
+
+
+def test_known_standard_errors(rng: np.random.Generator):
+    """Sums of squares follow χ², and intervals of parameters hold."""
+    alternative, at = ALTERNATIVES["time offset, friction"], points(FREQUENCIES)
+    value = np.zeros(14)
+    value[:6] = [1.5e-3] * 3 + [2.0, 3.0, 4.0]
+    exact = predicted(Explanation(alternative, value, value, np.ones(2), np.zeros(24), 0.0), at)
+    std, draws = np.array([np.full(12, 2e-3), np.full(12, 2e-2)]), 60
+    found = [
+        explain(alternative, at, *(exact + std * rng.standard_normal(exact.shape)), phase_std=std[1], gain_std=std[0])
+        for _ in range(draws)
+    ]
+    assert kstest([e.probability for e in found], "uniform").pvalue > 1e-4
+    for k in (0, 3, 5):
+        errors = np.array([(e.value[k] - value[k]) / e.std[k] for e in found])
+        assert np.sum(np.abs(errors) < 1.96) >= binom.ppf(1e-4, draws, 0.95)
+    wrong = explain(ALTERNATIVES["time offset"], at, *exact, phase_std=std[1], gain_std=std[0])
+    assert wrong.probability < 1e-6
+
+
+def run(arguments: list[str]) -> int:
+    with pytest.raises(SystemExit) as done:
+        cli.main(["vibration", *arguments])
+    return int(done.value.code or 0)
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert run([str(LOG), "-o", str(tmp_path / "out"), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result == json.loads((tmp_path / "out" / "vibration.json").read_text(encoding="utf-8"))
+    assert len(result["runs"]) == 12
+    assert result["supported"][0] == result["explanations"][0]["name"]
+    drawn = {path.name for path in (tmp_path / "out").glob("*.svg")}
+    assert drawn == {"responses.svg", "explanations.svg", "loop.svg"}
+
+
+def changed(campaign: Campaign, name: str, values: np.ndarray) -> Campaign:
+    return campaign.with_column(name, values, campaign.units[name])
+
+
+@pytest.mark.parametrize(
+    ("broken", "said"),
+    [
+        (lambda c: c.without("gimbal_x"), "needs columns gimbal_x"),
+        (lambda c: c.without("gimbal_x").without("table_z"), "table_z, gimbal_x"),
+        (lambda c: changed(c, "table_y", np.where(np.arange(len(c)) == 9, np.nan, 0)), "table_y is missing in row 10"),
+        (lambda c: changed(c, "table_x", np.zeros(len(c))), "at rest"),
+        (lambda c: c.select(slice(0, 200)), "less than a period"),
+        (lambda c: changed(c, "segment", np.arange(len(c))), "1 samples are fewer"),
+        (lambda c: c.with_metadata({"latitude_deg": None}), "latitude_deg"),
+    ],
+)
+def test_what_cannot_be_answered_is_refused(broken, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    log = read_campaign(LOG)
+    write_campaign(broken(log.select(log.columns["segment"] == 1)), tmp_path / "log.csv")
+    assert run([str(tmp_path / "log.csv"), "-o", str(tmp_path / "out")]) == 1
+    message = capsys.readouterr().err
+    assert said in message
+    assert message.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_runs_without_a_response_are_left_out_and_named():
+    log = read_campaign(LOG)
+    log = log.select(log.columns["segment"] <= 2)
+    at_rest = changed(log, "table_x", np.where(log.columns["segment"] == 1, 0.0, log.columns["table_x"]))
+    found = vibration_test(at_rest)
+    assert [r.run for r in found.responses] == [2]
+    assert found.remarks[0].startswith("run 1: left out, the table is at rest")
+    with pytest.raises(CampaignError, match="no run has a vibration"):
+        vibration_test(at_rest.select(at_rest.columns["segment"] == 1))
+
+
+def test_the_embedded_log_is_small():
+    assert LOG.stat().st_size < 300_000
+    assert gzip.decompress(LOG.read_bytes()).startswith(b"# ")
