@@ -15,6 +15,7 @@ SITES = {
     "gain": "The gain itself",
     "scale": "Terms of the scale-factor error ε",
     "rate": "Terms added to the input rate: bias, and what drives it",
+    "angle": "Of a platform's vibration test: terms of the base's angle less that of the table",
 }
 HEAD = """# The effect catalogue
 
@@ -22,6 +23,10 @@ This page is generated from the code by `python docs/make_effects_page.py`. Effe
 reports and JSON; `gyromodel effects ID` prints one entry in the terminal.
 
     output = gain · (rate + Σ rate terms) · (1 + Σ scale terms) + noise
+
+of a gyro, and of a stabilised platform on a vibration table
+
+    angle of the base − angle of the table = Σ angle terms + noise
 
 Parameters stand in the unit that files and reports use. "Typical" is a usual size; an amplitude starts at zero, which
 is exactly the model without the effect. The model is linear in all parameters but those marked *nonlinear*.

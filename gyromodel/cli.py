@@ -120,12 +120,14 @@ def fit(campaigns: Campaigns, model: ModelFile, output: Folder, axis: Axis = Non
     from gyromodel.attitude import with_reference_rates
     from gyromodel.estimate import fit as fit_model
     from gyromodel.model_files import read_model, write_model
+    from gyromodel.platform import fit_vibration, is_platform
 
     start, measured = read_model(model), read_campaigns(campaigns, axis)
+    of_platform = all(map(is_platform, measured))
     for line in [line for campaign in measured if (line := with_reference_rates(campaign)[1])]:
         print(f"gyromodel: {line}", file=sys.stderr)
     with progress_bar() as progress:
-        estimate = fit_model(measured, start, progress=progress)
+        estimate = fit_vibration(measured, start) if of_platform else fit_model(measured, start, progress=progress)
     result = estimate.to_dict()
     write_model(estimate, output / "model.yaml")
     write_text(output / "fit.json", json_text(result))
@@ -157,12 +159,15 @@ def diagnose(
     """Say what the simulation gets wrong, and why.
 
     Writes the extended model, the gain measured on data it did not see, and a report. Of a three-axis campaign each
-    axis has a folder of its own, and axes.json says how the three lie together.
+    axis has a folder of its own, and axes.json says how the three lie together. Logs of a platform's vibration test are
+    searched for what moves its base otherwise than the table.
     """
     if 0 < calibrate < 200:
         raise typer.BadParameter("200 campaigns or more show a 99 % point; 0 takes the safe threshold", param_hint="N")
     measured = read_campaigns(campaigns, axis)
-    if len(measured[0].outputs) > 1:
+    from gyromodel.platform import is_platform
+
+    if len(measured[0].outputs) > 1 and not is_platform(measured[0]):
         result, verdict, written = diagnose_axes(measured, model, output, calibrate, seed)
     else:
         diagnosis, verdict = diagnose_to(measured, model, output, calibrate=calibrate, seed=seed)

@@ -22,7 +22,7 @@ from gyromodel.campaign import Campaign
 from gyromodel.effects import Signals
 from gyromodel.effects.power_cycles import BiasTurnOn
 from gyromodel.estimate import Calibration, check_covariates, validity_unit
-from gyromodel.model import GyroModel, ModelError, check_units
+from gyromodel.model import GyroModel, ModelError, check_domain, check_units
 from gyromodel.signals import Record, rate_output, read_signals
 from gyromodel.units import from_internal
 
@@ -67,6 +67,7 @@ def compensate(campaign: Campaign, calibration: Calibration) -> Campaign:
     rated = with_reference_rates(campaign)[0] if turned else campaign
     record = read_signals(rated)
     record = record._replace(signals=record.signals | {"rate": jnp.zeros_like(record.signals["time"])})
+    check_domain(calibration.model, record.domain)
     # What the calibration leaves open, such as which thermometers, is the campaign's; what it states stays.
     model = calibration.model.prepared(record.signals)
     if late := next((e.label for e in model.effects if e.remembers and "rate" in e.columns_needed), None):

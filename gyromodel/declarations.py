@@ -36,6 +36,7 @@ class Declaration:
 
     id: str
     site: str
+    domain: str
     equation: str
     details: str
     parameters: tuple[ParameterDeclaration, ...]
@@ -95,6 +96,7 @@ def _declaration(node: ast.ClassDef, classes: dict[str, ast.ClassDef]) -> Declar
     return Declaration(
         id=literals["id"],
         site=literals["site"],
+        domain=literals.get("domain", "gyro"),
         equation=equation.strip(),
         details=details.strip(),
         parameters=tuple(parameters.values()),
@@ -121,7 +123,7 @@ def _assignments(node: ast.ClassDef) -> dict[str, ast.expr]:
 
 
 def _literals(node: ast.ClassDef) -> dict[str, Any]:
-    wanted = {"id", "site", "needs", "cause", "test"}
+    wanted = {"id", "site", "domain", "needs", "cause", "test"}
     return {name: ast.literal_eval(value) for name, value in _assignments(node).items() if name in wanted}
 
 

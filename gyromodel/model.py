@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from difflib import get_close_matches
 from typing import Any, NamedTuple
 
@@ -18,15 +19,18 @@ from gyromodel._checks import of_usual_unit, usual_unit
 from gyromodel.campaign import Campaign
 from gyromodel.declarations import column_of
 from gyromodel.effects import CATALOGUE, Effect, Signals
-from gyromodel.effects._base import evaluate, lacking
+from gyromodel.effects._base import Domain, evaluate, lacking
 from gyromodel.effects.drivers import BiasColumn
 from gyromodel.noise import NOISE_UNITS, NoiseRatios, markov_sum, stated_ratios
 from gyromodel.numerics.state_space import build_filter, colour
-from gyromodel.signals import Record, read_signals
+from gyromodel.signals import Record, domain_of, read_signals
 from gyromodel.units import convertible, from_internal
 
 # A local slope below this part of the gain is a dead band's.
 DEAD = 0.05
+# Sites of terms that are added to the input.
+ADDED = ("rate", "angle")
+OF = {"gyro": "a gyro", "platform": "a platform's base in a vibration test"}
 
 
 class ModelError(ValueError):
@@ -46,7 +50,8 @@ class GyroModel(eqx.Module):
     """output = Π gains · (rate + Σ rate terms) · (1 + Σ scale terms) + noise.
 
     `noise` holds coefficients in internal units by noise id, or is empty for "estimate it"; `fixed` names the
-    parameters that are known, as (effect label, field).
+    parameters that are known, as (effect label, field); `noise_of` says whether the noise is stated as that of a gyro's
+    rate or of a platform's angle. A model without effects and noise is of either.
     """
 
     effects: tuple[Effect, ...]
@@ -55,6 +60,7 @@ class GyroModel(eqx.Module):
     )
     fixed: frozenset[tuple[str, str]] = eqx.field(static=True, default=frozenset())
     gyro: str = eqx.field(static=True, default="")
+    noise_of: Domain = eqx.field(static=True, default="gyro")
 
     def __check_init__(self) -> None:
         labels = [e.label for e in self.effects]
@@ -64,6 +70,18 @@ class GyroModel(eqx.Module):
         unknown = set(self.noise) - set(NOISE_UNITS)
         if unknown:
             raise ModelError(f"unknown noise {min(unknown)}; known are {', '.join(NOISE_UNITS)}")
+        kinds: dict[str, str] = {e.domain: e.label for e in self.effects} | (
+            {self.noise_of: "noise"} if self.noise else {}
+        )
+        if len(kinds) > 1:
+            raise ModelError(
+                f"{kinds['platform']} is of {OF['platform']} and {kinds['gyro']} of {OF['gyro']}: keep those of one"
+            )
+
+    @property
+    def domain(self) -> Domain | None:
+        """Whether it is of a gyro or of a platform; None where nothing in it says so."""
+        return self.effects[0].domain if self.effects else self.noise_of if self.noise else None
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -78,7 +96,7 @@ class GyroModel(eqx.Module):
         replaced = {*effect.supersedes, *({effect.label} & self.wholly_fixed())}
         kept = tuple(e for e in self.effects if e.label not in replaced)
         fixed = frozenset(key for key in self.fixed if key[0] not in replaced)
-        return GyroModel((*kept, effect), self.noise, fixed, self.gyro)
+        return replace(self, effects=(*kept, effect), fixed=fixed)
 
     def wholly_fixed(self) -> set[str]:
         """Labels of the effects none of whose parameters is free."""
@@ -92,7 +110,7 @@ class GyroModel(eqx.Module):
             raise ModelError(f"the model has no {label}")
         effects = self.effects[:where] + self.effects[where + 1 :]
         left = {e.label for e in effects}
-        return GyroModel(effects, self.noise, frozenset(key for key in self.fixed if key[0] in left), self.gyro)
+        return replace(self, effects=effects, fixed=frozenset(key for key in self.fixed if key[0] in left))
 
     def columns_needed(self, effect: Effect) -> tuple[str, ...]:
         """The columns that one of the effects reads; a known scale factor serves without a rate, at rest."""
@@ -152,7 +170,7 @@ class GyroModel(eqx.Module):
         for effect in self.effects:
             if effect.site == "gain":
                 gain = gain * effect.value  # type: ignore[attr-defined]
-            elif effect.site == "rate":
+            elif effect.site in ADDED:
                 rate = rate + effect.contribution(signals)
             else:
                 scale = scale + effect.contribution(signals)
@@ -185,7 +203,7 @@ class GyroModel(eqx.Module):
         gain, rate, scale = self._sites(signals)
         if effect.site == "gain":
             return (rate * scale * gain / effect.value)[:, None]  # type: ignore[attr-defined]
-        weight = gain * scale if effect.site == "rate" else gain * rate
+        weight = gain * scale if effect.site in ADDED else gain * rate
         return weight[:, None] * effect.columns(signals)
 
     def steady_columns(self, signals: Signals) -> dict[int, np.ndarray]:
@@ -212,7 +230,7 @@ class GyroModel(eqx.Module):
             else:
                 pieces.append(None if effect.site == "gain" else [on_host(x) for x in evaluate(effect, signals)])
         for effect, piece in zip(self.effects, pieces, strict=True):
-            if piece is not None and effect.site == "rate":
+            if piece is not None and effect.site in ADDED:
                 rate = rate + piece[2]
             elif piece is not None:
                 scale = scale + piece[2]
@@ -229,7 +247,7 @@ class GyroModel(eqx.Module):
             alike = [k for k, declared in effect.declared().items() if declared.linear == linear]
             first = sum(np.size(getattr(effect, k)) for k in alike[: alike.index(name)])
             part = piece[0 if linear else 1][:, first : first + np.size(getattr(effect, name))]
-            columns.append((by_rate if effect.site == "rate" else by_scale)[:, None] * part)
+            columns.append((by_rate if effect.site in ADDED else by_scale)[:, None] * part)
         if not columns:
             return prediction, np.zeros((prediction.shape[0], 0))
         return prediction, (np if isinstance(prediction, np.ndarray) else jnp).concatenate(columns, axis=1)
@@ -274,12 +292,20 @@ def parameter_unit(effect: Effect, field: str, output_unit: str, units: Mapping[
     return unit
 
 
+def check_domain(model: GyroModel, domain: Domain) -> None:
+    """Refuse a model of a gyro for a platform, and the other way round."""
+    if model.domain not in (domain, None):
+        named = f"effect {model.effects[0].label}" if model.effects else "the noise of the model"
+        raise ModelError(f"{named} is of {OF[model.domain]}, but the campaign is of {OF[domain]}")
+
+
 def check_units(model: GyroModel, output_unit: str, units: Mapping[str, str]) -> None:
     """Refuse a scale factor or a driver's coefficient that was written in a unit which does not suit the campaign.
 
     Counts may leave out "per second", in the output as in the scale factor: count/deg and count/(deg/s) mean the same.
     """
-    if output_unit != "rad/s" and not any(e.site == "gain" for e in model.effects):
+    check_domain(model, domain_of(output_unit))
+    if output_unit not in ("rad/s", "rad") and not any(e.site == "gain" for e in model.effects):
         raise ModelError(f"the output is in [{output_unit}], which is no angular rate: the model needs a scale_factor")
     for effect in model.effects:
         foreign = [n for n in effect.columns_needed if n in units and not of_usual_unit(n, units[n])]

@@ -14,13 +14,14 @@ from gyromodel._atomic import write_text
 from gyromodel._checks import thermometers
 from gyromodel._yaml import Place, complaint, compose, exact_text
 from gyromodel.effects import Effect
+from gyromodel.effects._base import Domain
 from gyromodel.effects.drivers import BiasColumn
 from gyromodel.estimate import Calibration, Estimate, validity_unit
 from gyromodel.model import GyroModel, ModelError, make_effect, parameter_unit
-from gyromodel.noise import MARKOV_TIME, NOISE_UNITS, check_stated
+from gyromodel.noise import MARKOV_TIME, NOISE_UNITS, check_stated, noise_units
 from gyromodel.numerics.uncertain import Uncertain
 from gyromodel.signals import Record
-from gyromodel.units import from_internal, internal_unit
+from gyromodel.units import convertible, from_internal, internal_unit
 
 # Written into fitted models; `read_calibration` reads them, and no other use of the model needs them.
 RECORD_KEYS = ("fit", "software")
@@ -96,10 +97,11 @@ def _read(path: Path) -> tuple[GyroModel, dict[str, Place]]:
         effects.append(effect)
         if fixed.setdefault(effect.label, known) != known:
             raise item.error(f"of several {effect.label} all have the same parameters fixed, or none")
-    noise = _read_noise(top["noise"]) if "noise" in top else {}
+    of: list[Domain] = [effects[0].domain] if effects else ["gyro", "platform"]
+    noise, noise_of = _read_noise(top["noise"], of) if "noise" in top else ({}, of[0])
     gyro = top["gyro"].text() if "gyro" in top else ""
     try:
-        return GyroModel(tuple(effects), noise, frozenset().union(*fixed.values()), gyro), top
+        return GyroModel(tuple(effects), noise, frozenset().union(*fixed.values()), gyro, noise_of), top
     except ModelError as problem:
         raise top["effects"].error(str(problem)) from None
 
@@ -181,7 +183,7 @@ def _read_setting(place: Place, effect: Effect, name: str) -> Any:
     if isinstance(default, tuple | int):
         places = place.items(name) if isinstance(default, tuple) else [place]
         texts = [p.text() for p in places]
-        if isinstance(default, tuple) and isinstance(default[0], str):
+        if isinstance(default, tuple) and all(isinstance(each, str) for each in default):
             return tuple(texts)
         if not all(re.fullmatch(r"[-+]?\d{1,2}", text) for text in texts):
             raise place.error(f"{name} takes whole numbers below 100")
@@ -190,11 +192,12 @@ def _read_setting(place: Place, effect: Effect, name: str) -> Any:
     return place.quantity()[0] if isinstance(effect, BiasColumn) else place.number_in(SETTING_UNITS[name])
 
 
-def _read_noise(place: Place) -> dict[str, float]:
+def _read_noise(place: Place, of: list[Domain]) -> tuple[dict[str, float], Domain]:
+    """Coefficients, and what they are the noise of: one of those given, all in its units."""
     if isinstance(place.node, yaml.ScalarNode):
         if place.text() != "auto":
             raise place.error('noise is "auto" or a list of noise_* effects with values')
-        return {}
+        return {}, of[0]
     noise: dict[str, float] = {}
     for item in place.items("noise"):
         entry = item.mapping(("effect", "value", "lo", "hi", "time_constant"), "a noise entry")
@@ -206,7 +209,8 @@ def _read_noise(place: Place) -> dict[str, float]:
             raise entry["effect"].error(f"unknown noise {name}; known are {', '.join(known)}")
         if name in noise:
             raise entry["effect"].error(f"{name} appears twice")
-        noise[name] = entry["value"].number_in(NOISE_UNITS[name])
+        noise[name] = entry["value"].number_in(*(noise_units(domain)[name] for domain in of))
+        of = [d for d in of if convertible(entry["value"].quantity()[1], noise_units(d)[name])]
         if noise[name] < 0:
             raise entry["value"].error(f"{name} cannot be negative")
         if "time_constant" in entry:
@@ -217,7 +221,7 @@ def _read_noise(place: Place) -> dict[str, float]:
         check_stated(noise)
     except ValueError as problem:
         raise place.error(str(problem)) from None
-    return noise
+    return noise, of[0]
 
 
 def write_model(model: GyroModel | Estimate, path: str | Path) -> None:
@@ -260,7 +264,8 @@ def _document(model: GyroModel, estimate: Estimate | None) -> dict[str, Any]:
         if fixed:
             entry["fixed"] = True if len(fixed) == len(effect.declared()) else fixed
         document["effects"].append(entry)
-    noise = {k: {"effect": k, "value": exact_text(float(v), NOISE_UNITS[k])} for k, v in model.noise.items()}
+    units = noise_units(model.noise_of)
+    noise = {k: {"effect": k, "value": exact_text(float(v), units[k])} for k, v in model.noise.items()}
     if MARKOV_TIME in noise:
         noise["noise_markov"]["time_constant"] = noise.pop(MARKOV_TIME)["value"]
     document["noise"] = list(noise.values()) or "auto"

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from gyromodel._checks import MISSING_STEP, CampaignError, thermometers
 from gyromodel.campaign import Campaign
+from gyromodel.effects._base import Domain
 from gyromodel.numerics.smoothing import smooth_derivative
 from gyromodel.numerics.state_space import Sampling
 from gyromodel.units import UnitError, convertible, factor, internal_unit, quantity
@@ -28,10 +29,16 @@ IRREGULAR, MOST_REGULAR = 0.01, 0.9
 MOST_MISSING = 0.2
 
 
+def domain_of(output_unit: str) -> Domain:
+    """Whose output is in an internal unit: a platform's base is measured by its angle, and gyros by rates."""
+    return "platform" if output_unit == "rad" else "gyro"
+
+
 class Record(NamedTuple):
     """Signals of one or several campaigns of one unit, laid end to end.
 
-    `output` is a rate-type output (increments divided by their interval, angles differenced); `rows` is the number of
+    `output` is a rate-type output (increments divided by their interval, angles differenced), or of a platform the
+    angle of its base less that of the table; `rows` is the number of
     real rows before padding; `interval` the nominal sample interval (s); `units` the file's units by column; `blocks`
     numbers the stretches that replicate one another.
     """
@@ -45,6 +52,16 @@ class Record(NamedTuple):
     blocks: np.ndarray
     block_scheme: str
     data_hash: str = ""
+
+    @property
+    def domain(self) -> Domain:
+        """Whether it is of a gyro or of a platform."""
+        return domain_of(self.output_unit)
+
+    @property
+    def input_unit(self) -> str:
+        """The internal unit of what is measured: a rate, or of a platform an angle."""
+        return "rad" if self.domain == "platform" else "rad/s"
 
     @property
     def present(self) -> np.ndarray:
@@ -66,6 +83,8 @@ def padded_length(rows: int) -> int:
 
 def rate_output(campaign: Campaign) -> tuple[np.ndarray, str]:
     """The output as a rate and its internal unit, whatever the campaign recorded."""
+    if not campaign.outputs:
+        raise CampaignError(f"{campaign.name}: is of a platform: `diagnose` and `platform.fit_vibration` take it")
     if "output" not in campaign.columns:
         axes = ", ".join(campaign.outputs)
         raise CampaignError(f"{campaign.name}: has outputs {axes}; choose one axis (--axis x, y or z)")
@@ -165,7 +184,7 @@ def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
         schemes.add(scheme)
     signals = {n: np.concatenate(v) for n, v in parts.items()}
     units = {"campaign": ""} | {n: campaigns[0].units[n] for n in names}
-    record = _pad(signals, np.concatenate(blocks), " and ".join(sorted(schemes)), unit, units)
+    record = laid_out(signals, np.concatenate(blocks), " and ".join(sorted(schemes)), unit, units)
     return record._replace(data_hash="+".join(c.digest() for c in campaigns))
 
 
@@ -249,16 +268,25 @@ def with_columns_known(record: Record) -> tuple[Record, list[str]]:
     return record._replace(signals=signals), said
 
 
-def _pad(columns: dict[str, np.ndarray], blocks: np.ndarray, scheme: str, unit: str, units: dict[str, str]) -> Record:
+def laid_out(
+    columns: dict[str, np.ndarray], blocks: np.ndarray, scheme: str, unit: str, units: dict[str, str]
+) -> Record:
+    """A record from its signals, one entry a row, and the unit of its output.
+
+    Beside them `_interval` and `_restart`, and where they are not one and none `_white` and `_start`, are the sampling.
+    """
     rows = len(blocks)
     extra = padded_length(rows) - rows
-    interval, restart, output = columns.pop("_interval"), columns.pop("_restart"), columns["output"]
+    columns, output = dict(columns), columns["output"]
+    interval, restart = columns.pop("_interval"), columns.pop("_restart")
+    white, start = columns.pop("_white", np.ones(rows)), columns.pop("_start", None)
     signals = {n: jnp.asarray(np.pad(v, (0, extra), mode="edge")) for n, v in columns.items()}
     present = np.pad(np.isfinite(output), (0, extra))
     sampling = Sampling(
         jnp.asarray(np.pad(interval, (0, extra))),
         jnp.asarray(np.pad(restart, (0, extra))),
         jnp.asarray(present),
-        jnp.ones(rows + extra),
+        jnp.asarray(np.pad(white, (0, extra), constant_values=1.0)),
+        None if start is None else jnp.asarray(np.pad(start, (0, extra))),
     )
     return Record(signals, sampling, rows, float(np.median(interval[~restart])), unit, units, blocks, scheme)

@@ -11,8 +11,9 @@ def test_same_effects():
 def test_same_declarations():
     for entry in declarations().values():
         effect = CATALOGUE[entry.id]
-        assert (entry.site, entry.needs, entry.cause, entry.test) == (
+        assert (entry.site, entry.domain, entry.needs, entry.cause, entry.test) == (
             effect.site,
+            effect.domain,
             effect.needs,
             effect.cause,
             effect.test,
@@ -29,6 +30,6 @@ def test_every_entry_is_complete():
         assert entry.equation, entry.id
         assert entry.cause, entry.id
         assert entry.test, entry.id
-        assert entry.site in ("gain", "scale", "rate", "readout", "noise"), entry.id
+        assert entry.site in ("gain", "scale", "rate", "angle"), entry.id
         assert entry.parameters, entry.id
         assert all(parameter.meaning for parameter in entry.parameters), entry.id

@@ -23,7 +23,7 @@ from gyromodel.model import GyroModel, make_effect, model_from_effects
 from gyromodel.units import convertible, factor, internal_unit, parse, quantity
 
 ROWS = 64
-LABELS = [*sorted(set(CATALOGUE) - {"bias_column"}), "bias_pressure"]
+LABELS = [*sorted(n for n, kind in CATALOGUE.items() if kind.domain == "gyro" and n != "bias_column"), "bias_pressure"]
 DEG_H = np.pi / 180 / 3600
 G = 9.80665
 BAND = 30 * 0.519147497289467

@@ -31,7 +31,8 @@ from tests.test_c_code import CC, STRICT
 
 ROWS = 150
 REMEMBERING = sorted(name for name, kind in CATALOGUE.items() if kind.remembers)
-LABELS = [*sorted(set(CATALOGUE) - {"bias_column", "scale_factor", *REMEMBERING}), "bias_supply_voltage"]
+PLATFORM = sorted(name for name, kind in CATALOGUE.items() if kind.domain == "platform")
+LABELS = [*sorted(set(CATALOGUE) - {"bias_column", "scale_factor", *REMEMBERING, *PLATFORM}), "bias_supply_voltage"]
 # Biases that depend on no rate add up, and are compiled several together.
 BIASES = [n for n in LABELS if n != "bias" and effect_class(n).site == "rate" and "rate" not in effect_class(n).needs]
 REST = [n for n in LABELS if n not in (*BIASES, "bias")]

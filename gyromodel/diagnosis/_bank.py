@@ -43,7 +43,8 @@ class Block:
     """Columns of one form of one candidate; they stand at `start` … `start + width` of the bank.
 
     Forms of one `structure` differ only in the values of nonlinear parameters. `along` is what a driver's first column
-    is drawn over.
+    is drawn over; `least` the smallest
+    coefficient of a positive effect.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Block:
     structure: str
     effect: Effect | None
     along: np.ndarray | None = field(default=None, repr=False)
+    least: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,8 @@ def build_bank(record: Record) -> Bank:
     scans = []
     rate = np.asarray(signals.get("rate", jnp.zeros_like(signals["time"])))
     for name, kind in sorted(CATALOGUE.items()):
+        if kind.domain != record.domain:
+            continue
         if name == "bias_column" or (kind.site == "gain" and "rate" not in signals):
             if name != "bias_column":
                 not_testable[name] = "needs a column rate"
@@ -110,13 +114,15 @@ def build_bank(record: Record) -> Bank:
             elif part := kind.hidden(signals):
                 not_testable[PART_OF + name] = part
             blocks.extend((name, "effect", _weighted(e, signals, rate), e) for e in forms)
+    # A column of a platform's test is part of its motion, in proportion to which the angle errs by other names.
+    linear = record.domain == "gyro"
     for name in record.signals:
         reason = "" if is_no_driver(name) else unusable(record, name)
         if reason:
             not_testable |= {f"smooth({name})": reason} | (
-                {} if _is_owned(record, name) else {BiasColumn(column=name).label: reason}
+                {} if not linear or _is_owned(record, name) else {BiasColumn(column=name).label: reason}
             )
-    for name in [n for n in driver_names(record) if not _is_owned(record, n)]:
+    for name in [n for n in driver_names(record) if linear and not _is_owned(record, n)]:
         effect = BiasColumn(column=name).prepared(record.signals)
         blocks.append((effect.label, "effect", _weighted(effect, record.signals, rate), effect))
     along = {}
@@ -128,7 +134,18 @@ def build_bank(record: Record) -> Bank:
     for i in order:
         name, kind_of, shape, effect = blocks[i]
         width = shape.shape[1]
-        laid.append(Block(name, kind_of, start, width, _structure(name, effect, width), effect, along.get(i)))
+        laid.append(
+            Block(
+                name,
+                kind_of,
+                start,
+                width,
+                _structure(name, effect, width),
+                effect,
+                along.get(i),
+                effect.least(signals) if effect is not None else 0.0,
+            )
+        )
         start += shape.shape[1]
     columns = np.concatenate([blocks[i][2] for i in order], axis=1) if blocks else np.zeros((len(rate), 0))
     return Bank(columns, tuple(laid), tuple(scans), not_testable)

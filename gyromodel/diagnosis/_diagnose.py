@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
-from gyromodel.attitude import with_reference_rates
-from gyromodel.averages import MEAN_OF_ATTITUDE, MOST_TURN, average, turning
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores
+from gyromodel.diagnosis._data import read
 from gyromodel.diagnosis._evidence import SAFE_THRESHOLD
 from gyromodel.diagnosis._gain import ladder_error, nested_gain, no_gain, not_measured
 from gyromodel.diagnosis._isolation import settling_test
@@ -22,18 +22,15 @@ from gyromodel.diagnosis._result import Candidate, Cause, Diagnosis, Gain, Param
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import SLOW_IN_TIME, Found, NoisePath, Progress, Selection, search, standing
 from gyromodel.diagnosis._shapes import driver_shape, minimum_detectable, not_testable
-from gyromodel.diagnosis._variance import follow, growing_noise, noise_level, steps_of_output, tails, with_variance
+from gyromodel.diagnosis._variance import follow, growing_noise, noise_level, tails, with_variance
 from gyromodel.diagnosis._verdict import judge, structured, with_noise
 from gyromodel.estimate import Estimate, EstimateError, check_covariates, fit_record, with_noise_intervals
 from gyromodel.model import GyroModel, record_span
 from gyromodel.noise import NoiseGrid, NoiseRatios, noise_grid
-from gyromodel.poses import at_rest
-from gyromodel.signals import Record, read_signals, with_columns_known
-from gyromodel.units import convertible, factor, from_internal
+from gyromodel.signals import Record, with_columns_known
+from gyromodel.units import factor, from_internal
 
 FEWEST_DRAWS = 200
-# What a pose tells is in its mean: within it, means over so long (s) are enough, and keep out a hand's tremor.
-MEAN_OF_POSE = 1.0
 # Folds search the noise cells within this many nats of the best of the main pass.
 FOLD_NEARBY = 3.0
 
@@ -78,7 +75,8 @@ def diagnose(
     """Find what a model lacks on one unit's campaigns.
 
     Args:
-        campaigns: measured data of one unit; long ones are averaged first, and the findings say so.
+        campaigns: measured data of one gyro, or logs of vibration tests of one platform; long ones are averaged first,
+            and the findings say so.
         model: what the simulation contains.
         hold_out: whether to repeat the search without each block for the gain on data not seen; half of the work
             or more.
@@ -94,34 +92,8 @@ def diagnose(
         raise ValueError(f"{calibrate} draws cannot show a 99 % point: calibrate with {FEWEST_DRAWS} or more, or 0")
     say = progress or (lambda line, done: None)
     measured = [campaigns] if isinstance(campaigns, Campaign) else list(campaigns)
-    given, of_attitude = zip(*(with_reference_rates(c) for c in measured), strict=True)
-    campaigns = [at_rest(c) for c in given]
-    findings = [line for line in of_attitude if line]
-    findings += [
-        f"{len(np.unique(posed.columns['position']))} static poses were found in {c.name}; {len(c) - len(posed)} rows "
-        "in motion were left out."
-        for c, posed in zip(given, campaigns, strict=True)
-        if posed is not c
-    ]
-    shortened = [
-        average(c, seconds=MEAN_OF_POSE if c is not g else MEAN_OF_ATTITUDE * (g is not m))
-        for c, g, m in zip(campaigns, given, measured, strict=True)
-    ]
-    if any(m > 1 for _, m in shortened):
-        most = max(m for _, m in shortened)
-        findings.append(
-            f"Means of {most} consecutive samples were searched: lines above their sample rate and quantisation are "
-            "averaged away."
-        )
-    far = dict.fromkeys(n for c, (_, m) in zip(campaigns, shortened, strict=True) for n in turning(c, m))
-    findings += [f"{n} turns by more than {MOST_TURN:g} deg within a mean, which weakens what follows it." for n in far]
-    findings += [
-        f"The first {len(c)} of {len(g)} rows were searched: means tell nothing of the feedback ramp's codes."
-        for g, (c, m) in zip(campaigns, shortened, strict=True)
-        if m == 1 and len(c) < len(g)
-    ]
-    findings += [line for c in given if (line := steps_of_output(c))]
-    record = read_signals([c for c, _ in shortened])
+    data = read(measured)
+    record, findings, unit = data.record, list(data.findings), data.unit
     check_covariates(record, model)
     record, left_out = with_columns_known(record)
     findings += left_out
@@ -136,7 +108,6 @@ def diagnose(
         nulls = null_scores(session.scanner, baseline, calibrate, seed, say)
         session.threshold = max(float(np.quantile(nulls, 0.99)), 0.0)
     selection = session.run(baseline, say)
-    unit = _rate_unit(campaigns[0])
     beyond: list[Cause] = []
     grows, following = growing_noise(record, selection.estimate), None
     if grows is not None:
@@ -165,7 +136,7 @@ def diagnose(
             ratio = ParameterValue("ratio", grows.ratio, grows.ratio_std, "1")
             beyond.append(as_cause("noise_heteroscedastic", grows.evidence, ratio))
     free = _with_noise_estimated(selection.estimate)
-    hops = telegraph(baseline, free, unit) if free and _like_hops(selection, free) else None
+    hops = telegraph(baseline, free, unit) if free and record.domain == "gyro" and _like_hops(selection, free) else None
     if hops is not None:
         beyond.append(hops)
         findings.append("No fit holds hops of the bias: the extended model takes them for noise of the kinds it holds.")
@@ -177,7 +148,7 @@ def diagnose(
         selection = session.pruned(selection)
     findings += [line for line in (tails(selection.estimate), noise_level(selection.estimate)) if line]
     say("judging", 0.65)
-    scale = factor("rad/s", unit)
+    scale = factor(record.input_unit, unit)
     ordinary = tuple(hold_out and session.ladder(e)[2] for e in (baseline, selection.estimate))
     extended = _finished(selection.estimate, ordinary[1])
     weights = ordinary[0], extended.ordinary
@@ -186,12 +157,11 @@ def diagnose(
             "Parameters weigh all samples alike: that predicts left-out blocks better than the fitted noise's weights "
             "do."
         )
-    given_whole = [(c, c is m) for (c, _), m in zip(shortened, measured, strict=True)]
-    judgement = judge(record, session.scanner, baseline, selection, extended, len(bank.names()), nulls, given_whole)
+    judgement = judge(record, session.scanner, baseline, selection, extended, len(bank.names()), nulls, data.rows_of)
     if following and grows and judgement.verdict == "adequate":
         judgement = structured(judgement, selection.last, grows.column)
     stepped = None
-    if not _unfinished(selection) and (free := _with_noise_estimated(selection.estimate)):
+    if record.domain == "gyro" and not _unfinished(selection) and (free := _with_noise_estimated(selection.estimate)):
         stepped = quantisation(free, session.threshold)
     if stepped is not None:
         beyond.append(stepped)
@@ -206,18 +176,14 @@ def diagnose(
     )
     next_test = judgement.next_test
     if judgement.verdict == "ambiguous":
-        searched = [c for c, _ in shortened]
-        next_test = settling_test(searched, baseline.model, extended, list(judgement.credible_set)) or next_test
+        alike = list(judgement.credible_set)
+        next_test = settling_test(data.searched, baseline.model, extended, alike) or next_test
     gain = not_measured(unit) if not hold_out else _gain(session, baseline, selection, unit, scale, weights, say)
     driver = driver_shape(session.scanner, selection, judgement.driver, unit) if judgement.driver else None
     say("done", 1.0)
     rankings = [*(f.ranking for f in selection.path), selection.last]
-    whole = shortened[0][0] if len(shortened) == 1 else _together([c for c, _ in shortened])
     before, after = (np.asarray(e.model.predict(record.signals))[: record.rows] for e in (baseline, extended))
     slopes = [np.asarray(e.model.slope(record.signals))[: record.rows] for e in (baseline, extended)]
-    output_unit = campaigns[0].units["output"]
-    if campaigns[0].metadata["kind"] != "rate":
-        output_unit = f"{output_unit}/s"
     output = np.where(record.present, np.asarray(record.signals["output"])[: record.rows], np.nan)
     return Diagnosis(
         verdict=judgement.verdict,
@@ -237,9 +203,9 @@ def diagnose(
         threshold_kind="calibrated" if calibrate else "safe",
         p_value=_p_value(selection, nulls) if calibrate else None,
         searched=tuple(dict.fromkeys([*bank.names(), *(name for r in rankings for name in r.tangents)])),
-        campaign=whole,
-        predicted_before=from_internal(before, output_unit),
-        predicted_after=from_internal(after, output_unit),
+        campaign=data.whole,
+        predicted_before=from_internal(before, data.output_unit),
+        predicted_after=from_internal(after, data.output_unit),
         residual_before=(output - before) / slopes[0] * scale,
         residual_after=(output - after) / slopes[1] * scale,
         rate_unit=unit,
@@ -274,14 +240,6 @@ def _grid(record: Record, baseline: Estimate) -> NoiseGrid:
     return grid._replace(ratios=ratios, log_prior=np.concatenate([[0.0], prior]))
 
 
-def _rate_unit(campaign: Campaign) -> str:
-    """The unit errors are reported in: the output's if it is a rate, else the rate column's, else deg/s."""
-    for name in ("output", "rate"):
-        if name in campaign.units and convertible(campaign.units[name], "rad/s"):
-            return campaign.units[name]
-    return "deg/s"
-
-
 def _with_noise_estimated(estimate: Estimate) -> Estimate | None:
     """The fit with its noise estimated: less than a model states would be whitened too far, and look quantised.
 
@@ -289,7 +247,7 @@ def _with_noise_estimated(estimate: Estimate) -> Estimate | None:
     """
     if not estimate.noise_given:
         return estimate
-    free = GyroModel(estimate.model.effects, {}, estimate.model.fixed, estimate.model.gyro)
+    free = replace(estimate.model, noise={})
     try:
         return fit_record(estimate.record, free)
     except EstimateError:
@@ -366,19 +324,3 @@ def _ranking(ranking: Ranking) -> tuple[Candidate, ...]:
 
 def _kind(name: str) -> Literal["effect", "driver", "noise"]:
     return "driver" if is_driver(name) else "noise" if is_noise(name) else "effect"
-
-
-def _together(campaigns: list[Campaign]) -> Campaign:
-    first = campaigns[0]
-    names = [n for n in first.columns if n != "time"]
-    columns = {"time": [], **{n: [] for n in names}}
-    start = 0.0
-    for campaign in campaigns:
-        time = campaign.in_unit("time", first.units["time"])
-        columns["time"].append(time - time[0] + start)
-        start = columns["time"][-1][-1] + np.median(np.diff(time))
-        for name in names:
-            columns[name].append(campaign.in_unit(name, first.units[name]))
-    whole = Campaign({n: np.concatenate(v) for n, v in columns.items()}, first.units, first.metadata, first.name)
-    number = np.repeat(1.0 + np.arange(len(campaigns)), [len(c) for c in campaigns])
-    return whole if "campaign" in names else whole.with_column("campaign", number, "")

@@ -27,7 +27,7 @@ NOT_DRIVERS = ("time", "output", "segment", "run", "position", "feedback_ramp", 
 
 def is_no_driver(name: str) -> bool:
     """Whether a signal is bookkeeping, the output, or derived from others."""
-    return name in NOT_DRIVERS or bool(DERIVED.fullmatch(name))
+    return name in NOT_DRIVERS or name.startswith("_") or bool(DERIVED.fullmatch(name))
 
 
 def unusable(record: Record, name: str) -> str:
@@ -54,7 +54,9 @@ def smooths(record: Record) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
             continue  # it may wrap round, which is no rate of change
         for derived, values in _history(record, name):
             yield from _of_one(record, f"smooth({derived})", values)
-    rate_first = sorted(names, key=lambda n: n not in ("rate", "temperature"))[:3]
+    # What repeats with an oscillation is a function of its angle and rate.
+    paired = ("rate", "temperature") if record.domain == "gyro" else ("table", "table_rate")
+    rate_first = sorted(names, key=lambda n: n not in paired)[: 3 if record.domain == "gyro" else 2]
     for i, a in enumerate(rate_first):
         for b in rate_first[i + 1 :]:
             x, y = (np.asarray(record.signals[n]) for n in (a, b))

@@ -46,6 +46,8 @@ def addition(
         frequency = np.append(line_frequencies(estimate.model), _lines(scanner, ranking, estimate.model))
         none = jnp.zeros(len(frequency))
         effect = BiasPeriodic(cosine=none, sine=none, frequency=jnp.asarray(frequency))
+    for held in estimate.model.effects:
+        effect = effect.joined(held) if held.label == effect.label and effect.label in effect.supersedes else effect
     return _solved(scanner, estimate, effect, ranking.best_cell(name), pulses).settled(), ()
 
 
@@ -84,7 +86,7 @@ def form_effect(scanner: Scanner, name: str, form: int) -> Effect | None:
 def _solved(scanner: Scanner, estimate: Estimate, effect: Effect, g: int, pulses: tuple[int, ...]) -> Effect:
     """The effect at the coefficients that fit best beside the baseline, in one noise cell."""
     model = estimate.model
-    model = GyroModel(tuple(e for e in model.effects if e.label not in effect.supersedes), {}, model.fixed, model.gyro)
+    model = replace(model, effects=tuple(e for e in model.effects if e.label not in effect.supersedes), noise={})
     if effect.site == "gain":
         return effect
     columns = model.columns_of(effect, scanner.record.signals)

@@ -107,14 +107,14 @@ def settling_test(
     """The further test that best parts effects which stand for one another, in words; None if none known helps.
 
     Args:
-        campaigns: what was measured.
+        campaigns: what was measured; of a platform none, whose next test is not computed.
         baseline: the simulation.
         extended: the fit with one of the effects.
         names: the effects; gross errors and noise among them are left out.
     """
     names = [name for name in names if name != "outliers" and not name.startswith("noise_")]
     first = next((name for name in names if name in extended.model.labels), None)
-    if first is None or len(names) < 2:
+    if first is None or len(names) < 2 or not campaigns:
         return None
     without = extended.model.without(first)
     for effect in baseline.effects:

@@ -241,8 +241,8 @@ def line_frequencies(model: GyroModel) -> np.ndarray:
 def skipped(model: GyroModel, columns: Iterable[str]) -> set[str]:
     """Candidates that make no sense beside a model: what it has free, and what it has in a more general form.
 
-    Beside a bias proportional to one thermometer, one of a second thermometer is the same as one of their difference,
-    which keeps the name; unless the model has the second.
+    What contains its own smaller forms may grow. Beside a bias proportional to one thermometer, one of a second
+    thermometer is the same as one of their difference, which keeps the name; unless the model has the second.
     """
     held = model.wholly_fixed()
     have = {name for e in model.effects for name in (e.label, *e.supersedes)}
@@ -251,4 +251,5 @@ def skipped(model: GyroModel, columns: Iterable[str]) -> set[str]:
         have.add("bias_temperature_gradient")
     elif "bias_temperature" in have:
         have |= seconds
-    return have - held - {"bias_step", "bias_periodic"}
+    grows = {e.label for e in model.effects if e.label in e.supersedes}
+    return have - held - grows - {"bias_step", "bias_periodic"}

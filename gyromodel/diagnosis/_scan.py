@@ -107,6 +107,7 @@ class Scanner:
         self._name_starts = np.cumsum([0, *map(len, parts.values())])[:-1]
         self._widths = np.array([b.width for b in bank.blocks], int)
         self._positive = np.array([b.effect is not None and b.effect.positive for b in bank.blocks])
+        self._least = np.array([b.least for b in bank.blocks])
         self.epochs = np.flatnonzero(self.present[: record.rows])[1:-1]
 
     def without(self, rows: np.ndarray, cells: list[int]) -> Scanner:
@@ -265,7 +266,8 @@ class Scanner:
             along = vectors.transpose(0, 2, 1) @ (b / norm[:, :, None])
             t = np.sum(np.where(keep, 1.0 / np.where(keep, values, 1.0), 0.0)[:, :, None] * along**2, axis=1)
             here = slice(first, first + count)
-            t_of[here] = np.where(self._positive[here, None] & (b[:, 0] < 0), 0.0, t)
+            small = b[:, 0] < (self._least[here] * a[:, 0, 0] * norm[:, 0] ** 2)[:, None]
+            t_of[here] = np.where(self._positive[here, None] & small, 0.0, t)
             q_of[here] = keep.sum(1)
             energy[here] = np.sum(values * keep, axis=1) / np.maximum(q_of[here], 1) * np.mean(norm**2, axis=1)
         # A form that loses more columns than the baseline contains is another form in disguise.

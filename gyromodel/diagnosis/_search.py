@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -208,7 +208,7 @@ def refit(record: Record, baseline: Estimate, found: list[Found], noise: NoisePa
             model = model.with_effect(step.effect)
     rows = [r for f in found for r in f.rows]
     data = record.without(np.array(rows)) if rows else record
-    model = GyroModel(model.effects, baseline.model.noise if given else {}, model.fixed, model.gyro)
+    model = replace(model, noise=baseline.model.noise if given else {})
     freed = [f.name for f in found if f.frees_noise]
     for attempt in (model, _shapes_held(model, found)):
         try:
@@ -226,18 +226,18 @@ def refit(record: Record, baseline: Estimate, found: list[Found], noise: NoisePa
 
 
 def _shapes_held(model: GyroModel, found: list[Found]) -> GyroModel:
-    """The model with shapes at their searched values, but for effects that have no free coefficient besides."""
+    """The model with shapes at their searched values; an effect without a free coefficient keeps its last one free."""
     held = set()
     for effect in (f.effect for f in found if f.effect is not None):
         linear = {name for name, declared in effect.declared().items() if declared.linear}
-        if linear - set(effect.held):
-            held |= {(effect.label, name) for name in effect.declared() if name not in linear}
+        shapes = [name for name in effect.declared() if name not in linear]
+        held |= {(effect.label, name) for name in (shapes if linear - set(effect.held) else shapes[:-1])}
     return replace_fixed(model, model.fixed | frozenset(held))
 
 
 def replace_fixed(model: GyroModel, fixed: frozenset[tuple[str, str]]) -> GyroModel:
     """The model with another set of fixed parameters."""
-    return GyroModel(model.effects, model.noise, fixed, model.gyro)
+    return replace(model, fixed=fixed)
 
 
 def uncontested(step: Found) -> bool:

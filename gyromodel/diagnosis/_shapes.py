@@ -114,7 +114,7 @@ def driver_shape(scanner: Scanner, selection: Selection, name: str, unit: str) -
     assert along is not None
     file_unit, x = driver_unit(record, smooth_columns(name)[0]), along[: record.rows]
     order = np.argsort(x)[:: max(1, record.rows // 300)]
-    scale = factor("rad/s", unit)
+    scale = factor(record.input_unit, unit)
     label = " and ".join(smooth_columns(name))
     found = from_internal(x[order], file_unit), value[order] * scale, std[order] * scale
     return Driver(label, file_unit, *found, unit, *_nearest(ranking, name, explained))

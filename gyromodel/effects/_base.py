@@ -15,10 +15,13 @@ from jaxtyping import Array, Float
 from gyromodel._checks import accelerations, thermometers
 
 Signals = Mapping[str, Float[Array, " sample"]]
-Site = Literal["gain", "scale", "rate"]
+Site = Literal["gain", "scale", "rate", "angle"]
+Domain = Literal["gyro", "platform"]
 # In `needs`: any thermometer besides `temperature`, and any column of specific force. Columns of which one is enough
 # are joined by " or ".
 SECOND_THERMOMETER, ANY_ACCELERATION = "temperature_<place>", "acceleration_<axis>"
+# … and the angles of a vibration test, which effects of a platform see in parts of their own.
+TABLE_ANGLES, GIMBAL_ANGLES = "table_<axis>", "gimbal_<axis>"
 
 
 @dataclass(frozen=True)
@@ -59,10 +62,11 @@ CATALOGUE: dict[str, type[Effect]] = {}
 class Effect(eqx.Module):
     """One additive term of the gyro model.
 
-    `site` says where it acts in output = gain · (rate + Σ rate terms) · (1 + Σ scale terms). Fields declared with
-    `parameter` are its parameters. `columns` returns one column per linear coefficient, in field order, and may depend
-    on the nonlinear ones; the contribution is columns @ coefficients, so zero coefficients are exactly the model
-    without it.
+    `site` says where it acts in output = gain · (rate + Σ rate terms) · (1 + Σ scale terms), and `domain` whose output
+    it is: that of a gyro, or the angle of a platform's base less that of its table, a sum of angle terms alone. Fields
+    declared with `parameter` are its parameters. `columns` returns one column per linear coefficient, in field order,
+    and may depend on the nonlinear ones; the contribution is columns @ coefficients, so zero coefficients are exactly
+    the model without it.
     `supersedes` lists effects that this one contains as a special case; `held` the fields that physics
     or the search fixes; `positive` says that the (only) coefficient cannot be negative; `scan` names a fast search over
     every epoch or frequency; `untested` says why a campaign leaves it no `candidates`; `remembers` that a sample's
@@ -72,6 +76,7 @@ class Effect(eqx.Module):
 
     id: ClassVar[str]
     site: ClassVar[Site]
+    domain: ClassVar[Domain] = "gyro"
     needs: ClassVar[tuple[str, ...]]
     cause: ClassVar[str]
     test: ClassVar[str]
@@ -139,6 +144,14 @@ class Effect(eqx.Module):
         """Fields that are neither parameters nor the column and unit of a driver."""
         return tuple(f.name for f in fields(cls) if f.name not in (*cls.declared(), "column", "unit"))
 
+    def least(self, signals: Signals) -> float:
+        """The smallest coefficient with which a `positive` form means anything: a share of one, say, not of 1e-3."""
+        return 0.0
+
+    def joined(self, held: Effect) -> Self:
+        """What takes the place of the same effect in another form where a model holds that, without coefficients."""
+        return self
+
     def settled(self) -> Self:
         """The form to fit once the search has chosen this one; fields in `held` are left as they are here."""
         return self
@@ -160,7 +173,7 @@ class Effect(eqx.Module):
         return changed
 
     def contribution(self, signals: Signals) -> Float[Array, " sample"]:
-        """The effect's term, in rad/s for site "rate", dimensionless for "scale"."""
+        """The effect's term, in rad/s for site "rate", rad for "angle", dimensionless for "scale"."""
         return self.columns(signals) @ self.linear()
 
     def shape_derivatives(self, signals: Signals) -> Float[Array, "sample shape"]:
@@ -190,6 +203,7 @@ def lacking(needed: Iterable[str], signals: Signals) -> list[str]:
         return []
     groups = {SECOND_THERMOMETER: len(thermometers(signals)) > 1, ANY_ACCELERATION: bool(accelerations(signals))}
     groups["run"] = "run" in signals or "campaign" in signals
+    groups |= dict.fromkeys((TABLE_ANGLES, GIMBAL_ANGLES), "_frequency" in signals)
     return [each for each in needed if not any(groups.get(n, n in signals) for n in each.split(" or "))]
 
 

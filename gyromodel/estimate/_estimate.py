@@ -11,7 +11,7 @@ import numpy as np
 from gyromodel._checks import thermometers
 from gyromodel.estimate._calibration import Calibration, ParameterRow
 from gyromodel.model import GyroModel, parameter_unit
-from gyromodel.noise import NOISE_UNITS, NoiseRatios, coefficients
+from gyromodel.noise import NoiseRatios, coefficients, noise_units
 from gyromodel.numerics.uncertain import Source, Uncertain, factor_of
 from gyromodel.signals import Record
 from gyromodel.units import factor, internal_unit
@@ -75,7 +75,7 @@ class Estimate:
 
     def model_as_given(self) -> GyroModel:
         """The fitted model with its noise to be estimated again, unless it was stated."""
-        return self.model if self.noise_given else GyroModel(self.model.effects, {}, self.model.fixed, self.model.gyro)
+        return self.model if self.noise_given else replace(self.model, noise={})
 
     def calibration(self) -> Calibration:
         """What it takes to use the fit elsewhere: the model with its units, the covariance, and the ranges it has seen.
@@ -93,7 +93,7 @@ class Estimate:
             values = np.ravel(record.signals.get(name, np.nan))[: record.rows]
             if np.isfinite(values).any():
                 validity[name] = (float(np.nanmin(values)), float(np.nanmax(values)))
-        model = GyroModel(tuple(effects), self.model.noise, self.model.fixed, self.model.gyro)
+        model = replace(self.model, effects=tuple(effects))
         return Calibration(model, self.covariance, validity, self.degrees_of_freedom, record.data_hash)
 
     def table(self) -> tuple[ParameterRow, ...]:
@@ -105,7 +105,7 @@ class Estimate:
         rows: dict[str, dict[str, float | str]] = {}
         for name, coefficient in self.model.noise.items():
             value = float(coefficient)
-            unit = NOISE_UNITS[name]
+            unit = noise_units(self.model.noise_of)[name]
             scale = factor(internal_unit(unit), unit)
             low, high = self.noise_interval.get(name, (value, value))
             rows[name] = {"value": value * scale, "lo": low * scale, "hi": high * scale, "unit": unit}

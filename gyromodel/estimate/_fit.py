@@ -16,7 +16,7 @@ from gyromodel.campaign import Campaign
 from gyromodel.estimate._estimate import Estimate, EstimateError, noise_coefficients
 from gyromodel.estimate._noise import best_ratios, settled, with_noise_intervals
 from gyromodel.estimate._optimistix import optimistix_solution
-from gyromodel.model import GyroModel, ModelError, check_units, record_span
+from gyromodel.model import GyroModel, ModelError, check_domain, check_units, record_span
 from gyromodel.noise import NoiseRatios, from_grams, markov_sum, stated_ratios
 from gyromodel.numerics.least_squares import Normal, Solution, levenberg_marquardt
 from gyromodel.numerics.state_space import Filter, build_filter, colour, whiten, whitened_gram
@@ -126,7 +126,8 @@ def check_enough(record: Record, parameters: int) -> None:
 
 
 def check_covariates(record: Record, model: GyroModel) -> None:
-    """Refuse missing values in a column that an effect needs, and a missing column."""
+    """Refuse missing values in a column that an effect needs, a missing column, and a model of another domain."""
+    check_domain(model, record.domain)
     model = model.prepared(record.signals)
     for effect in model.effects:
         # Several campaigns serve as the runs that none of them has a column of.
@@ -220,7 +221,7 @@ def _finish(
     whitened = np.full(rows, np.nan)
     whitened[record.present] = w[:, p] / np.sqrt(white)
     return Estimate(
-        model=GyroModel(model.effects, noise, model.fixed, model.gyro),
+        model=replace(model, noise=noise, noise_of=record.domain),
         covariance=covariance * white,
         degrees_of_freedom=nu,
         residual=np.where(record.present, np.asarray(residual)[:rows], np.nan),

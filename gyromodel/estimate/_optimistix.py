@@ -7,6 +7,7 @@ uncertainty of parameters that were held fixed reaches the fitted ones.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -67,7 +68,7 @@ def _response(model: GyroModel, held: GyroModel | None, changes, signals, signal
 
     def refitted(errors):
         effects = model.effects if held is None else held.with_vector(held.vector() + changes @ errors).effects
-        moved = GyroModel(effects, model.noise, model.fixed, model.gyro)
+        moved = replace(model, effects=effects)
         seen = {**signals, **{name: signals[name] + change @ errors for name, change in signal_changes.items()}}
         return _solve(moved, x, seen, filter)[0]
 

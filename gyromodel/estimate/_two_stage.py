@@ -73,7 +73,7 @@ def _held(first: Estimate, second: Estimate) -> tuple[GyroModel, list[int]]:
     of_first = [(first.model.labels[s.effect], s.field, s.index) for s in first.model.slots()]
     taken = {(label, field) for label, field, _ in of_first} & second.model.fixed
     others = frozenset((e.label, name) for e in second.model.effects for name in e.declared()) - taken
-    held = GyroModel(second.model.effects, second.model.noise, others, second.model.gyro)
+    held = replace(second.model, fixed=others)
     of_held = [(held.labels[s.effect], s.field, s.index) for s in held.slots()]
     if not of_held:
         raise EstimateError("the second fit holds no parameter that the first one fitted: fix it in the second model")

@@ -23,9 +23,11 @@ def export_calibration(calibration: Calibration, to: Form, axis: str = "x") -> s
         axis: which one that is, of the autopilot's gyro.
 
     Raises:
-        ModelError: an effect does not say which columns it reads; to C, one that looks at other samples, or computes
-            what a few C statements cannot; to PX4, one that it has no parameter for.
+        ModelError: the model is of a platform, or an effect does not say which columns it reads; to C, one that looks
+            at other samples, or computes what a few C statements cannot; to PX4, one that it has no parameter for.
     """
+    if calibration.model.domain == "platform":
+        raise ModelError("a model of a platform's base corrects no gyro: only models of gyros are exported")
     for effect in calibration.model.effects:
         if unnamed := [name for name in effect.columns_needed if "<" in name]:
             raise ModelError(

@@ -16,7 +16,7 @@ from gyromodel._checks import usual_unit
 from gyromodel.effects.drivers import BiasColumn
 from gyromodel.estimate import Calibration, validity_unit
 from gyromodel.model_files import SETTING_UNITS, parameter_names
-from gyromodel.noise import MARKOV_TIME, NOISE_UNITS
+from gyromodel.noise import MARKOV_TIME, noise_units
 from gyromodel.units import factor, from_internal, internal_unit
 
 FORMULA = (
@@ -77,7 +77,7 @@ def _noise(calibration: Calibration) -> list[Entry]:
     found = []
     for name, x in calibration.model.noise.items():
         effect, what = ("noise_markov", "time_constant") if name == MARKOV_TIME else (name, "value")
-        unit = NOISE_UNITS[name]
+        unit = noise_units(calibration.model.noise_of)[name]
         found.append(Entry(effect, "noise", what, float(from_internal(x, unit)), math.nan, unit, float(x)))
     return found
 

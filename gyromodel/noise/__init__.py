@@ -15,6 +15,7 @@ from gyromodel.noise._model import (
     markov_cells,
     markov_sum,
     noise_grid,
+    noise_units,
     stated_ratios,
 )
 from gyromodel.noise._terms import NoiseTerm
@@ -38,6 +39,7 @@ __all__ = [
     "markov_cells",
     "markov_sum",
     "noise_grid",
+    "noise_units",
     "restricted_likelihood",
     "stated_ratios",
     "with_gaps",

@@ -7,7 +7,7 @@ K²/(2πf)² and K²τ/3, Markov (q T)²/(1 + (2πf T)²) with variance q²T/2.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +21,21 @@ MARKOV_TIME = "noise_markov_time"
 NOISE_UNITS = {
     name: NOISE[name].unit for name in ("noise_white", "noise_flicker", "noise_random_walk", "noise_markov")
 } | {MARKOV_TIME: "s"}
+
+# The same of an angle, such as that of a platform's base.
+ANGLE_NOISE_UNITS = {
+    "noise_white": "deg/sqrt(Hz)",
+    "noise_flicker": "deg",
+    "noise_random_walk": "deg/sqrt(h)",
+    "noise_markov": "deg/sqrt(h)",
+    MARKOV_TIME: "s",
+}
+
+
+def noise_units(of: Literal["gyro", "platform"]) -> dict[str, str]:
+    """Units of stated noise: of a gyro's rate, or of the angle of a platform's base."""
+    return ANGLE_NOISE_UNITS if of == "platform" else NOISE_UNITS
+
 
 # Up to this many samples (averaged test points, say) noise is taken as white: they cannot show its colour.
 FEWEST_FOR_COLOUR = 40

@@ -24,13 +24,15 @@ class Sampling(NamedTuple):
     """When the samples were taken and how far each can be trusted.
 
     `interval[t]` is the time since the previous sample (s); `restart[t]` opens an independent record; `present[t]` is
-    False for a missing sample; `white[t]` is the white variance relative to the unit of the noise model.
+    False for a missing sample; `white[t]` is the white variance relative to the unit of the noise model; `start[t]`
+    the variance, in that unit, of a constant which a record that opens there has of its own: none without it.
     """
 
     interval: Float[Array, " sample"]
     restart: Bool[Array, " sample"]
     present: Bool[Array, " sample"]
     white: Float[Array, " sample"]
+    start: Float[Array, " sample"] | None = None
 
 
 class MarkovSum(NamedTuple):
@@ -79,14 +81,16 @@ def _filter_on(covariance, noise: MarkovSum, sampling: Sampling):
     """The covariance after some samples that follow on `covariance`, and their filter."""
     cells = noise.variance.ndim - 1
     prior, identity = _prior(noise), _over_cells(jnp.eye(len(noise.decay)), cells)
+    # A constant is a state that does not decay, as a random walk is.
+    constant = identity * _over_cells((noise.decay == 0).astype(float), cells)
 
     def step(covariance, inputs):
-        interval, restart, present, white = inputs
+        interval, restart, present, white, start = inputs
         # Transition into this sample from the previous one.
         phi = jnp.exp(-noise.decay * interval)
         added = noise.variance * _over_cells(jnp.where(noise.decay > 0, 1.0 - phi**2, interval), cells)
         moved = _over_cells(jnp.outer(phi, phi), cells) * covariance + identity * added
-        covariance = jnp.where(restart, prior, moved)
+        covariance = jnp.where(restart, prior if start is None else prior + constant * start, moved)
         cross = covariance.sum(1)
         variance = cross.sum(0) + white
         gain = jnp.where(present, cross / variance, 0.0)

@@ -39,6 +39,7 @@ from gyromodel.platform._increments import coning, integrals, sculling
 from gyromodel.platform._loop import Loop, Margins, Mount, margins, measured_response
 from gyromodel.platform._motion import GIMBALS, TABLE, BaseMotion, base_motion, is_platform
 from gyromodel.platform._navigation import Navigation, attitudes, navigate
+from gyromodel.platform._record import VibrationRecord, fit_vibration, vibration_record
 from gyromodel.platform._responses import Response, responses
 from gyromodel.platform._sensitivity import attitude_sensitivity
 from gyromodel.platform._simulation import Axis, simulate_axis
@@ -69,6 +70,7 @@ __all__ = [
     "PublishedResponse",
     "Response",
     "SineFit",
+    "VibrationRecord",
     "VibrationTest",
     "assumed_loop",
     "attitude_sensitivity",
@@ -82,6 +84,7 @@ __all__ = [
     "euler_attitude",
     "explain",
     "fit_sines",
+    "fit_vibration",
     "gimbal_attitude",
     "gravity",
     "integrals",
@@ -108,5 +111,6 @@ __all__ = [
     "separation",
     "simulate_axis",
     "transport_rate",
+    "vibration_record",
     "vibration_test",
 ]

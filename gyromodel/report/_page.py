@@ -88,7 +88,7 @@ def context(diagnosis: Diagnosis) -> dict[str, Any]:
         "ladder": _ladder(diagnosis),
         "gain": _gain(diagnosis),
         "nearest": _nearest(diagnosis),
-        "noise": _noise(diagnosis.noise),
+        "noise": _noise(diagnosis.noise, _noise_of(diagnosis)),
         "noise_kinds": _noise_kinds(diagnosis),
         "credible": [
             {
@@ -247,13 +247,20 @@ def _gain(diagnosis: Diagnosis) -> dict[str, Any]:
     }
 
 
-def _noise(noise: Mapping[str, Mapping[str, float | str]]) -> list[dict[str, str]]:
+def _noise_of(diagnosis: Diagnosis) -> str:
+    """Whether noise is that of an angle."""
+    return "angle" if any(entry.get("unit") == "deg/sqrt(Hz)" for entry in diagnosis.noise.values()) else "noise"
+
+
+def _noise(noise: Mapping[str, Mapping[str, float | str]], of: str) -> list[dict[str, str]]:
     rows = []
     for name, entry in noise.items():
         value, low, high = (float(entry.get(key, math.nan)) for key in ("value", "lo", "hi"))
         interval = f"{number(low, 3)} to {number(high, 3)}" if math.isfinite(low) or math.isfinite(high) else "–"
         unit = unit_text(str(entry.get("unit", "")))
-        rows.append({"title": title(name), "id": name, "value": number(value, 3), "interval": interval, "unit": unit})
+        rows.append(
+            {"title": title(name, of), "id": name, "value": number(value, 3), "interval": interval, "unit": unit}
+        )
     return rows
 
 
@@ -276,7 +283,9 @@ def _noise_kinds(diagnosis: Diagnosis) -> str:
         return ""
 
     def made_of(name: str, share: float) -> str:
-        return f"{listed([title(part).lower() for part in name.split(' + ')])} ({100 * share:.0f} %)"
+        return (
+            f"{listed([title(part, _noise_of(diagnosis)).lower() for part in name.split(' + ')])} ({100 * share:.0f} %)"
+        )
 
     likely = [made_of(*kind) for kind in kinds[:2] if kind[1] >= 0.05]
     return f"Most probably {', or '.join(likely)}."

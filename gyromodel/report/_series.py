@@ -23,6 +23,11 @@ _BY_RATE = ("scale_",)
 _BY_TIME = ("bias_drift", "bias_step", "bias_warmup", "noise_random_walk")
 _BY_NAME = {
     "bias_periodic": "phase",
+    "sync_delay": "table_rate",
+    "shaft_friction": "table_rate",
+    "loop_dynamics": "table_rate",
+    "loop_resonance": "table",
+    "platform_drift": "time",
     "bias_temperature_rate": "temperature:rate",
     "bias_temperature_curve": "temperature",
     "bias_temperature_gradient": "temperature:difference",

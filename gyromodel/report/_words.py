@@ -48,6 +48,13 @@ PHRASES = {
     "output_axis_acceleration": "a response to angular acceleration about the output axis",
     "time_delay": "a delay of the output",
     "bandwidth": "a limited bandwidth (lag)",
+    "sync_delay": "a delay between the clocks of table and platform",
+    "loop_resonance": "a resonance of the base on its mount",
+    "shaft_friction": "friction of the shafts",
+    "loop_dynamics": "a stabilisation loop other than the simulated one",
+    "gimbal_nonorthogonality": "gimbal axes that are not at right angles",
+    "encoder_harmonic": "an error of encoders that repeats with their angle",
+    "platform_drift": "a drift of the platform in inertial space",
     "outliers": "outlying points",
     "noise_white": "white rate noise (angle random walk)",
     "noise_flicker": "flicker noise (bias instability)",
@@ -60,7 +67,17 @@ PHRASES = {
 }
 
 
-_DRIVERS = {"campaign": "the campaign (from run to run)"}
+# Of an angle, such as that of a platform's base, the same names of noise mean other things.
+_OF_ANGLE = {
+    "noise_white": "white noise of the angle",
+    "noise_flicker": "flicker noise of the angle",
+    "noise_random_walk": "an angle random walk",
+}
+_DRIVERS = {
+    "campaign": "the campaign (from run to run)",
+    "table": "the table's angle",
+    "table_rate": "the table's rate",
+} | {f"gimbal_{name}": f"the angle of gimbal {name.replace('_', ' ')}" for name in ("y_outer", "x", "y", "z")}
 
 
 def spoken(name: str) -> str:
@@ -81,9 +98,11 @@ def _driven(column: str) -> str:
 
 
 def phrase(effect: str, kind: str = "effect") -> str:
-    """An effect as a noun with its article."""
+    """An effect as a noun with its article; of kind "angle" the noise of an angle."""
     if kind == "driver":
         return f"some smooth function of {driver_name(effect)}"
+    if kind == "angle" and effect in _OF_ANGLE:
+        return _OF_ANGLE[effect]
     base = re.split(r"[\[(:]", effect, maxsplit=1)[0].strip()
     detail = effect[len(base) :].strip("[](): ")
     if base in PHRASES:

@@ -1,0 +1,118 @@
+"""What is searched of measured campaigns: means, poses and reference rates of gyros, angles of a platform's base."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gyromodel._checks import CampaignError
+from gyromodel.attitude import with_reference_rates
+from gyromodel.averages import MEAN_OF_ATTITUDE, MOST_TURN, average, turning
+from gyromodel.campaign import Campaign
+from gyromodel.diagnosis._variance import steps_of_output
+from gyromodel.platform import is_platform, vibration_record
+from gyromodel.poses import at_rest
+from gyromodel.signals import Record, read_signals
+from gyromodel.units import convertible
+
+# What a pose tells is in its mean: within it, means over so long (s) are enough, and keep out a hand's tremor.
+MEAN_OF_POSE = 1.0
+
+
+@dataclass(frozen=True)
+class Data:
+    """A record to search and where it comes from.
+
+    Attributes:
+        record: the signals.
+        searched: the campaigns that a further test could repeat; none of a platform.
+        rows_of: the campaigns that rows are told of, and whether they are as given.
+        whole: one campaign with the record's rows, which reports show.
+        findings: what was done to the measured data, in sentences.
+        unit: that errors are told in.
+        output_unit: that of the output as it was recorded, a rate or of a platform an angle.
+    """
+
+    record: Record
+    searched: tuple[Campaign, ...]
+    rows_of: tuple[tuple[Campaign, bool], ...]
+    whole: Campaign
+    findings: tuple[str, ...]
+    unit: str
+    output_unit: str
+
+
+def read(measured: Sequence[Campaign]) -> Data:
+    """Campaigns of one gyro, or logs of one platform, as they are searched."""
+    of_platform = [is_platform(c) for c in measured]
+    if all(of_platform):
+        test = vibration_record(measured)
+        return Data(test.record, (), ((test.campaign, False),), test.campaign, test.findings, "deg", "deg")
+    if any(of_platform):
+        raise CampaignError(f"{measured[of_platform.index(True)].name} is of a platform, and others are of a gyro")
+    return _of_gyro(measured)
+
+
+def _of_gyro(measured: Sequence[Campaign]) -> Data:
+    given, of_attitude = zip(*(with_reference_rates(c) for c in measured), strict=True)
+    campaigns = [at_rest(c) for c in given]
+    findings = [line for line in of_attitude if line]
+    findings += [
+        f"{len(np.unique(posed.columns['position']))} static poses were found in {c.name}; {len(c) - len(posed)} rows "
+        "in motion were left out."
+        for c, posed in zip(given, campaigns, strict=True)
+        if posed is not c
+    ]
+    shortened = [
+        average(c, seconds=MEAN_OF_POSE if c is not g else MEAN_OF_ATTITUDE * (g is not m))
+        for c, g, m in zip(campaigns, given, measured, strict=True)
+    ]
+    if any(m > 1 for _, m in shortened):
+        most = max(m for _, m in shortened)
+        findings.append(
+            f"Means of {most} consecutive samples were searched: lines above their sample rate and quantisation are "
+            "averaged away."
+        )
+    far = dict.fromkeys(n for c, (_, m) in zip(campaigns, shortened, strict=True) for n in turning(c, m))
+    findings += [f"{n} turns by more than {MOST_TURN:g} deg within a mean, which weakens what follows it." for n in far]
+    findings += [
+        f"The first {len(c)} of {len(g)} rows were searched: means tell nothing of the feedback ramp's codes."
+        for g, (c, m) in zip(campaigns, shortened, strict=True)
+        if m == 1 and len(c) < len(g)
+    ]
+    findings += [line for c in given if (line := steps_of_output(c))]
+    searched = tuple(c for c, _ in shortened)
+    output_unit = campaigns[0].units["output"]
+    if campaigns[0].metadata["kind"] != "rate":
+        output_unit = f"{output_unit}/s"
+    whole = searched[0] if len(searched) == 1 else _together(searched)
+    rows_of = tuple((c, c is m) for c, m in zip(searched, measured, strict=True))
+    return Data(
+        read_signals(searched), searched, rows_of, whole, tuple(findings), _rate_unit(campaigns[0]), output_unit
+    )
+
+
+def _rate_unit(campaign: Campaign) -> str:
+    """The unit errors are reported in: the output's if it is a rate, else the rate column's, else deg/s."""
+    for name in ("output", "rate"):
+        if name in campaign.units and convertible(campaign.units[name], "rad/s"):
+            return campaign.units[name]
+    return "deg/s"
+
+
+def _together(campaigns: Sequence[Campaign]) -> Campaign:
+    first = campaigns[0]
+    names = [n for n in first.columns if n != "time"]
+    columns = {"time": [], **{n: [] for n in names}}
+    start = 0.0
+    for campaign in campaigns:
+        time = campaign.in_unit("time", first.units["time"])
+        columns["time"].append(time - time[0] + start)
+        start = columns["time"][-1][-1] + np.median(np.diff(time))
+        for name in names:
+            columns[name].append(campaign.in_unit(name, first.units[name]))
+    whole = Campaign({n: np.concatenate(v) for n, v in columns.items()}, first.units, first.metadata, first.name)
+    number = np.repeat(1.0 + np.arange(len(campaigns)), [len(c) for c in campaigns])
+    return whole if "campaign" in names else whole.with_column("campaign", number, "")

@@ -1,0 +1,416 @@
+"""Effects of a stabilised platform on the angle of its base that gimbals and navigation give, less that of the table.
+
+Each run of a vibration test is an oscillation of one frequency about each axis: what passes through a filter H(s) is
+Re[H(jω) z] of an oscillation z. Signals of an underscore are made from the log by `gyromodel.platform`, means over
+the samples of a row: `_real`, `_imaginary` and `_frequency` of the table's own angle, and what the base's angle about
+the axis of the row changes by with each gimbal, each tilt and each turn of the platform.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Self
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from gyromodel.effects._base import Effect, Signals, parameter, stack
+
+# Shafts that turn the platform body itself, and the orders of encoder errors that are searched.
+SHAFTS, ENCODERS = ("gimbal_x", "gimbal_y", "gimbal_z"), ("gimbal_y_outer", "gimbal_x", "gimbal_y", "gimbal_z")
+ORDERS = (1, 2, 3, 4)
+# Odd harmonics that stand for a friction's change of sign.
+ODD = (1, 3, 5, 7)
+# What each gimbal's axis may have besides its direction: of the other two of x, y, z.
+TILTS = tuple(
+    f"{gimbal}/{axis}" for gimbal, axes in zip(ENCODERS, ("xz", "yz", "xz", "xy"), strict=True) for axis in axes
+)
+# Phases (rad) that a delay makes at the highest frequency, the least by a share; as parts of the lowest and times the
+# highest frequency, where modes are searched; their damping; corners of loops (rad/s).
+PHASES = np.concatenate([[0.03, 0.2], np.arange(0.5, 6.6, 0.3)])
+LOWEST_MODE, HIGHEST_MODE, MODES, DAMPING = 0.5, 10.0, 25, (0.05, 0.2, 0.7)
+CORNERS = (5.0, 15.0, 30.0, 60.0, 150.0)
+# A share that is not small, and phases (rad), or frequencies over that of a mode, below which any share will do.
+LEAST, SLIGHT = 0.5, 0.3
+# Hz from which a mount is none.
+STIFF = 1e4
+# Columns that keep less than this part of their length beside others cannot be seen beside them.
+SEEN = 0.02
+
+
+class _OfPlatform(Effect):
+    """A term of the base's angle."""
+
+    domain = "platform"
+    site = "angle"
+
+
+def _oscillation(signals: Signals) -> Complex[Array, " sample"]:
+    """z of the table's angle Re z about the axis of each row."""
+    return signals["_real"] + 1j * signals["_imaginary"]
+
+
+def _frequencies(signals: Signals) -> Float[np.ndarray, " row"]:
+    """Angular rates (rad/s) of the rows where the table oscillates."""
+    frequency = np.asarray(signals["_frequency"])
+    return frequency[np.hypot(np.asarray(signals["_real"]), np.asarray(signals["_imaginary"])) > 0]
+
+
+def _independent(columns: dict[str, np.ndarray]) -> tuple[str, ...]:
+    """Names of columns of which none is (nearly) a sum of others, the longest first."""
+    left, chosen = {name: np.asarray(c, float) for name, c in columns.items()}, []
+    length = {name: float(np.linalg.norm(c)) for name, c in left.items()}
+    most = max(length.values(), default=0.0)
+    while left:
+        norms = {name: float(np.linalg.norm(c)) for name, c in left.items()}
+        name = max(norms, key=lambda n: norms[n])
+        if norms[name] <= SEEN * most:
+            break
+        axis = left.pop(name) / norms[name]
+        left = {n: c - axis * (axis @ c) for n, c in left.items()}
+        left = {n: c for n, c in left.items() if np.linalg.norm(c) > SEEN * length[n]}
+        chosen.append(name)
+    return tuple(n for n in columns if n in chosen)
+
+
+class SyncDelay(_OfPlatform):
+    """θ += θ_t(t − δ) − θ_t(t): the clock of the platform is late against that of the table, on every axis alike.
+
+    The search lets a share of the effect vary to have a linear coefficient; the fit holds it at one.
+    """
+
+    id = "sync_delay"
+    needs = ("table_<axis>", "gimbal_<axis>")
+    cause = "Records of table and platform are started or stamped at different times."
+    test = "Oscillate at several frequencies about every axis: a delay turns all phases in proportion to frequency."
+    held = ("share",)
+    positive = True
+    untested = "no run oscillates about an axis"
+
+    share: Float[Array, ""] = parameter("1", 1.0, "part of the motion that is late", default=1.0)
+    delay: Float[Array, ""] = parameter("ms", 1.0, "by how much the platform's records are late", linear=False)
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """Re[(exp(−jωδ) − 1) z]."""
+        turned = jnp.exp(-1j * signals["_frequency"] * self.delay) - 1.0
+        return stack(jnp.real(turned * _oscillation(signals)))
+
+    def least(self, signals: Signals) -> float:
+        """Little of a motion that is much late would turn phases as nothing does that has one delay."""
+        return LEAST if float(jnp.abs(self.delay)) * _frequencies(signals).max() > SLIGHT else 0.0
+
+    def settled(self) -> Self:
+        """All of the motion is late, by as much as has the same slope."""
+        return type(self)(share=jnp.ones(()), delay=self.share * self.delay)
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """Late and early, up to more than a period of the highest frequency."""
+        frequency = _frequencies(signals)
+        return [cls(delay=sign * p / frequency.max()) for sign in (1, -1) for p in PHASES] if len(frequency) else []
+
+
+class LoopResonance(_OfPlatform):
+    """θ += H θ_t − θ_t, H = (1 + 2ζs/ω_n)/(1 + 2ζs/ω_n + s²/ω_n²): the base swings on its mount.
+
+    The search lets a share of the effect vary to have a linear coefficient, which far below the mode is −s²/ω_n²; the
+    fit holds it at one.
+    """
+
+    id = "loop_resonance"
+    needs = ("table_<axis>", "gimbal_<axis>")
+    cause = "An isolator or a soft structure carries the base on the table."
+    test = (
+        "Oscillate at more frequencies, up to the mode: the response of a mode peaks there, that of a delay does not."
+    )
+    held = ("share",)
+    positive = True
+    untested = "no run oscillates about an axis"
+
+    share: Float[Array, ""] = parameter("1", 1.0, "part of the motion that passes the mode", default=1.0)
+    damping: Float[Array, ""] = parameter("1", 0.1, "ζ of the mode", linear=False, default=0.1)
+    natural_frequency: Float[Array, ""] = parameter("Hz", 20.0, "ω_n/2π of the mode", linear=False, default=20.0)
+
+    def __check_init__(self) -> None:
+        if not (0 <= self.damping <= 1 and 0 < self.natural_frequency < STIFF):
+            raise ValueError("a mode has a damping from zero to one and a frequency below 10 kHz")
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """Re[(H(jω) − 1) z]."""
+        s = 1j * signals["_frequency"] / (2.0 * jnp.pi * self.natural_frequency)
+        carried = 1.0 + 2.0 * self.damping * s
+        return stack(jnp.real((carried / (carried + s**2) - 1.0) * _oscillation(signals)))
+
+    def least(self, signals: Signals) -> float:
+        """Little of a motion that passes a mode within the band would turn phases as no mount does."""
+        return LEAST if float(self.natural_frequency) * SLIGHT < _frequencies(signals).max() / (2.0 * np.pi) else 0.0
+
+    def settled(self) -> Self:
+        """All of the motion passes a mode that does as much far below it."""
+        stiffer = self.natural_frequency / jnp.sqrt(jnp.maximum(self.share, 1e-6))
+        return type(self)(share=jnp.ones(()), natural_frequency=stiffer, damping=self.damping)
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """Modes from below the lowest frequency to far above the highest."""
+        hertz = _frequencies(signals) / (2.0 * np.pi)
+        if not len(hertz):
+            return []
+        modes = np.geomspace(LOWEST_MODE * hertz.min(), HIGHEST_MODE * hertz.max(), MODES)
+        return [cls(natural_frequency=f, damping=jnp.asarray(d)) for f in modes for d in DAMPING]
+
+
+class _ThroughLoop(_OfPlatform):
+    """Friction of the shafts turns the body along with the base, as far as a loop lets it.
+
+    Of a body of inertia J in a loop of damping J ω_c (1 + ω_i/s): viscous friction c turns it by
+    R = c s/(J s² + J ω_c (s + ω_i)) of what the shaft turns, Coulomb friction M by M/c times what R makes of the sign
+    of the shaft's rate: odd harmonics. The platform takes its body for still, so that the base's angle misses it.
+    """
+
+    viscous: Float[Array, " shaft"] = parameter("1", 0.01, "c/(J ω_c) of each shaft", default=())
+    coulomb: Float[Array, " shaft"] = parameter("deg/s", 0.01, "M/(J ω_c) of each shaft", default=())
+    integral: Float[Array, ""] = parameter("Hz", 5.0, "ω_i/2π of the loop's correction", linear=False, default=5.0)
+    lag: Float[Array, ""] = parameter("ms", 5.0, "1/ω_c of the loop", linear=False, default=5e-3)
+    shafts: tuple[str, ...] = eqx.field(static=True, default=())
+
+    def __check_init__(self) -> None:
+        if unknown := set(self.shafts) - set(SHAFTS):
+            raise ValueError(f"{min(unknown)} is no shaft that turns the platform: these are {', '.join(SHAFTS)}")
+        if {np.shape(v)[0] for v in (self.viscous, self.coulomb)} - {0, len(self.shafts)}:
+            raise ValueError("viscous and coulomb take one number for each of the shafts, or none")
+
+    def turned(self, signals: Signals, gain: Float[Array, ""] | float = 1.0) -> Float[Array, "sample coefficient"]:
+        """−Re[R ∂θ/∂β z] of each shaft's viscous friction, then its Coulomb friction; the loop's gain times `gain`."""
+        corner, columns = 2.0 * jnp.pi * self.integral, []
+
+        def response(s: Array) -> Array:
+            return 1.0 / (gain * (s + corner) + self.lag * s**2)
+
+        for shaft in self.shafts if self.viscous.size else ():
+            s = 1j * signals[f"_{shaft}_frequency"]
+            columns.append(-jnp.real(s * response(s) * _passed(signals, shaft, 1) * signals[f"_{shaft}_amplitude"]))
+        for shaft in self.shafts if self.coulomb.size else ():
+            total = 0.0
+            for n in ODD:
+                # sign(cos x) = 4/π Σ (−1)^k cos((2k + 1) x)/(2k + 1), of the shaft's rate: Re[j e^(jωt)].
+                s, size = 1j * n * signals[f"_{shaft}_frequency"], 4.0 / np.pi * (-1) ** (n // 2) / n * 1j**n
+                total = total - jnp.real(size * response(s) * _passed(signals, shaft, n))
+            columns.append(total)
+        return stack(*columns) if columns else jnp.zeros((signals["time"].shape[0], 0))
+
+
+def _passed(signals: Signals, shaft: str, n: int) -> Complex[Array, " sample"]:
+    """What the n-th harmonic of a shaft's oscillation, at amplitude one, makes of the base's angle."""
+    return signals[f"_{shaft}_{n}_real"] + 1j * signals[f"_{shaft}_{n}_imaginary"]
+
+
+class ShaftFriction(_ThroughLoop):
+    """θ −= Σ R ∂θ/∂β (viscous β + coulomb ∫ sgn dβ/dt dt): friction of the shafts turns the platform with its base.
+
+    Through a loop of damping J ω_c (1 + ω_i/s) on a body of inertia J, R = s/(s + ω_i + s²/ω_c). The platform takes its
+    body for still, so that the angle of the base misses what it turns by.
+    """
+
+    id = "shaft_friction"
+    needs = ("table_<axis>", "gimbal_<axis>")
+    cause = "Bearings, slip rings and leads drag the platform along with its base."
+    test = "Oscillate over a decade of frequency and at other amplitudes: Coulomb friction stays as it is."
+    untested = "no run turns a shaft of the platform"
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """Of each shaft's viscous friction, then of its Coulomb friction."""
+        return self.turned(signals)
+
+    def prepared(self, signals: Signals) -> Self:
+        """Both kinds of friction in every shaft that turns, unless they are set."""
+        if self.shafts:
+            return self
+        shafts = _turning(signals)
+        none = jnp.zeros(len(shafts))
+        return type(self)(none, none, self.integral, self.lag, shafts)
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """Viscous friction, and Coulomb friction beside it, in all shafts that turn; loops of several corners."""
+        shafts = _turning(signals)
+        some, none = jnp.zeros(len(shafts)), jnp.zeros(0)
+        kinds = ((some, none), (some, some)) if shafts else ()
+        return [cls(v, c, jnp.asarray(w / (2.0 * np.pi)), shafts=shafts) for v, c in kinds for w in CORNERS]
+
+
+def _turning(signals: Signals) -> tuple[str, ...]:
+    """Shafts that oscillate in some run."""
+    return tuple(s for s in SHAFTS if np.asarray(signals[f"_{s}_amplitude"]).max() > 0)
+
+
+class LoopDynamics(_ThroughLoop):
+    """θ −= what the friction of the shafts turns the platform by, through a loop of another gain or correction.
+
+    As `shaft_friction` with R = s/((s + ω_i)/(1 + κ) + s²/ω_c): far below the crossover it lets 1 + κ times as much
+    through, of a gain K_0 that is 1/(1 + κ) of the simulated one.
+    """
+
+    id = "loop_dynamics"
+    needs = ("table_<axis>", "gimbal_<axis>")
+    cause = "The stabilisation loop has another gain, correction or lag than the simulated one."
+    test = "Measure the loop's step response, or oscillate at another gain of the amplifier: friction stays as it is."
+    supersedes = ("shaft_friction",)
+    held = ("viscous", "coulomb", "lag")
+    reach = 20.0
+    untested = "a loop shows only in what friction it lets through, and the model has no shaft_friction of known size"
+
+    compliance: Float[Array, ""] = parameter("1", 0.1, "κ: what it lets through, less one", linear=False)
+
+    def __check_init__(self) -> None:
+        if self.compliance <= -1:
+            raise ValueError("a loop lets something through: its compliance is above -1")
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """Of each shaft's viscous friction, then of its Coulomb friction."""
+        return self.turned(signals, 1.0 / (1.0 + self.compliance))
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """None by itself: see `continuing`."""
+        return []
+
+    @classmethod
+    def continuing(cls, effects: Sequence[Effect]) -> Self | None:
+        """The model's own friction, through the simulated loop."""
+        for e in effects:
+            if isinstance(e, ShaftFriction) and np.any(np.asarray(e.linear()) != 0):
+                return cls(e.viscous, e.coulomb, e.integral, e.lag, e.shafts)
+        return None
+
+
+class GimbalNonorthogonality(_OfPlatform):
+    """θ −= Σ ∂θ/∂τ τ: each gimbal's axis is tilted by small angles τ towards the other axes of its frame.
+
+    Named by gimbal and axis; those that a test cannot show beside the others are left out. The angle that a tilt adds
+    to the mean of a run is part of the alignment, which is not known.
+    """
+
+    id = "gimbal_nonorthogonality"
+    needs = ("table_<axis>", "gimbal_<axis>")
+    cause = "Gimbal axes are not at right angles, or the base is turned on the table."
+    test = "Turn the base on the table by 90° and repeat: tilts of the gimbals turn with it, those of the table stay."
+    untested = "no motion is large enough to show a tilt"
+
+    supersedes = ("gimbal_nonorthogonality",)
+    tilt: Float[Array, " tilt"] = parameter("arcsec", 20.0, "of each of `tilts`", default=())
+    tilts: tuple[str, ...] = eqx.field(static=True, default=())
+
+    def __check_init__(self) -> None:
+        if unknown := set(self.tilts) - set(TILTS):
+            raise ValueError(f"{min(unknown)} is no tilt: these are {', '.join(TILTS)}")
+        if np.shape(self.tilt) != (len(self.tilts),):
+            raise ValueError("tilt takes one angle for each of the tilts")
+
+    def joined(self, held: Effect) -> Self:
+        """The tilts of both."""
+        tilts = tuple(n for n in TILTS if n in (*self.tilts, *held.tilts))  # type: ignore[attr-defined]
+        return type(self)(jnp.zeros(len(tilts)), tilts)
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """−∂θ/∂τ of each."""
+        return stack(*(signals[f"_{name}"] for name in self.tilts))
+
+    def prepared(self, signals: Signals) -> Self:
+        """Every tilt that shows, unless they are set."""
+        if self.tilts:
+            return self
+        tilts = _independent({name: np.asarray(signals[f"_{name}"]) for name in TILTS})
+        return type(self)(jnp.zeros(len(tilts)), tilts)
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """All that show, together and one by one."""
+        whole = cls().prepared(signals)
+        each = [cls(jnp.zeros(1), (name,)) for name in whole.tilts]
+        return [whole, *each] if len(each) > 1 else each
+
+
+class EncoderHarmonic(_OfPlatform):
+    """θ += Σ ∂θ/∂β (c_k cos kβ + s_k sin kβ): encoders of gimbals read too much, by the angle that they read.
+
+    Named by gimbal and order k; those that a test cannot show beside the others are left out.
+    """
+
+    id = "encoder_harmonic"
+    needs = ("table_<axis>", "gimbal_<axis>")
+    cause = "The disc of an encoder is off centre, or its two signals are unlike."
+    test = "Oscillate by tens of degrees about other mean angles: the error keeps to the angle of the gimbal."
+    untested = "no gimbal turns far enough"
+
+    supersedes = ("encoder_harmonic",)
+    cosine: Float[Array, " term"] = parameter("arcsec", 10.0, "c_k of each of `terms`", default=())
+    sine: Float[Array, " term"] = parameter("arcsec", 10.0, "s_k of each of `terms`", default=())
+    terms: tuple[str, ...] = eqx.field(static=True, default=())
+
+    def __check_init__(self) -> None:
+        known = [f"{gimbal}/{k}" for gimbal in ENCODERS for k in ORDERS]
+        if unknown := set(self.terms) - set(known):
+            raise ValueError(f"{min(unknown)} is no term: these are {', '.join(known)}")
+        if not np.shape(self.cosine) == np.shape(self.sine) == (len(self.terms),):
+            raise ValueError("cosine and sine take one angle for each of the terms")
+
+    def joined(self, held: Effect) -> Self:
+        """The terms of both."""
+        terms = tuple(dict.fromkeys((*held.terms, *self.terms)))  # type: ignore[attr-defined]
+        return type(self)(jnp.zeros(len(terms)), jnp.zeros(len(terms)), terms)
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """∂θ/∂β cos kβ of each term, then ∂θ/∂β sin kβ."""
+        return stack(*(signals[f"_{term}_{part}"] for part in ("cosine", "sine") for term in self.terms))
+
+    def prepared(self, signals: Signals) -> Self:
+        """The first orders of every gimbal that turns far enough, unless they are set."""
+        if self.terms:
+            return self
+        forms = type(self)._shown(signals)
+        most = max(forms, key=len, default=())
+        return type(self)(jnp.zeros(len(most)), jnp.zeros(len(most)), most)
+
+    @classmethod
+    def _shown(cls, signals: Signals) -> list[tuple[str, ...]]:
+        """Sets of terms that show: each order of each gimbal, the first two, and those of all gimbals together."""
+        found: list[tuple[str, ...]] = []
+        pairs: list[str] = []
+        for gimbal in ENCODERS:
+            orders = [(f"{gimbal}/{k}",) for k in ORDERS if _shows(signals, (f"{gimbal}/{k}",))]
+            found += orders
+            both = (f"{gimbal}/1", f"{gimbal}/2")
+            if _shows(signals, both):
+                found.append(both)
+                pairs += both
+        return [*found, tuple(pairs)] if len(pairs) > 2 and _shows(signals, tuple(pairs)) else found
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """Terms of one gimbal, and of all."""
+        return [cls(jnp.zeros(len(t)), jnp.zeros(len(t)), t) for t in cls._shown(signals)]
+
+
+def _shows(signals: Signals, terms: tuple[str, ...]) -> bool:
+    """Whether cosines and sines of some terms are told apart."""
+    names = [f"_{term}_{part}" for part in ("cosine", "sine") for term in terms]
+    columns = {name: np.asarray(signals[name]) for name in names}
+    return len(_independent(columns)) == len(names)
+
+
+class PlatformDrift(_OfPlatform):
+    """θ −= Σ ∂θ/∂φ ω_d t, from the start of each run: the body turns slowly in inertial space."""
+
+    id = "platform_drift"
+    needs = ("table_<axis>", "gimbal_<axis>")
+    cause = "Biases of the gyros that hold the platform, or a latitude and heading that are not those of the test."
+    test = "Keep the table still for some minutes, at two headings: a drift of the body turns with it."
+
+    rate: Float[Array, " axis"] = parameter("deg/h", 0.1, "ω_d about x, y, z of the body", default=(0.0, 0.0, 0.0))
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """−∂θ/∂φ t of each axis."""
+        return stack(*(signals[f"_drift_{axis}"] for axis in "xyz"))
