@@ -33,6 +33,7 @@ class Data:
         findings: what was done to the measured data, in sentences.
         unit: that errors are told in.
         output_unit: that of the output as it was recorded, a rate or of a platform an angle.
+        step: of the coarsest reading that the output is computed from, internal units; zero where none shows.
     """
 
     record: Record
@@ -42,6 +43,7 @@ class Data:
     findings: tuple[str, ...]
     unit: str
     output_unit: str
+    step: float = 0.0
 
 
 def read(measured: Sequence[Campaign]) -> Data:
@@ -49,7 +51,8 @@ def read(measured: Sequence[Campaign]) -> Data:
     of_platform = [is_platform(c) for c in measured]
     if all(of_platform):
         test = vibration_record(measured)
-        return Data(test.record, (), ((test.campaign, False),), test.campaign, test.findings, "deg", "deg")
+        rows_of = ((test.campaign, False),)
+        return Data(test.record, (), rows_of, test.campaign, test.findings, "deg", "deg", test.step)
     if any(of_platform):
         raise CampaignError(f"{measured[of_platform.index(True)].name} is of a platform, and others are of a gyro")
     return _of_gyro(measured)

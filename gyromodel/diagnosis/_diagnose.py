@@ -62,6 +62,22 @@ class _Session:
                 return Selection(estimates[-1], found, path, step.ranking, estimates, None, remains=step.name)
         return selection
 
+    def resolved(self, selection: Selection, step: float) -> Selection:
+        """The rounds, cut before an effect that is nowhere half a step of the readings large.
+
+        Readings of what moves within a step stand still, and a still reading of a moving thing is an error that
+        follows the motion: it is not the noise that the evidence weighs.
+        """
+        for i, (done, estimate) in enumerate(zip(selection.path, selection.estimates[1:], strict=False)):
+            if done.effect is not None and done.effect.label in estimate.model.labels:
+                effect = estimate.model.effects[estimate.model.labels.index(done.effect.label)]
+                size = np.asarray(effect.contribution(self.record.signals))[: self.record.rows]
+                if np.abs(size).max() < 0.5 * step:
+                    path, estimates = selection.path[:i], selection.estimates[: i + 1]
+                    found = tuple(standing(path))
+                    return Selection(estimates[-1], found, path, done.ranking, estimates, None, remains=done.name)
+        return selection
+
 
 def diagnose(
     campaigns: Campaign | Sequence[Campaign],
@@ -143,6 +159,12 @@ def diagnose(
         first = selection.path[0].ranking if selection.path else selection.last
         start = _with_noise_estimated(baseline) or baseline
         selection = Selection(start, (), (), first, (start,), None)
+    whole, selection = selection, session.resolved(selection, data.step)
+    if whole is not selection:
+        findings.append(
+            f"{selection.remains} would be within half a step of the encoders ({np.rad2deg(data.step):.2g} deg) "
+            "throughout, where readings that stand still pass for it: not named."
+        )
     if hold_out:
         say("judging each step on blocks left out", 0.62)
         selection = session.pruned(selection)

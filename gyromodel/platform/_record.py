@@ -32,6 +32,8 @@ FEWEST = 24
 UNKNOWN = 1e6
 # A sine is one whose energy is so many times the noise's, and what else moves may be this part of it.
 SEEN, UNLIKE = 50.0, 0.05
+# Times that a reading returns where the steps of an encoder show.
+OFTEN = 4
 # Time between two stretches of the record in reports, s.
 PAUSE = 1.0
 
@@ -39,12 +41,14 @@ PAUSE = 1.0
 class VibrationRecord(NamedTuple):
     """What a log says, ready to be searched.
 
-    record: the angles; campaign: its rows as reports show them; findings: what was done to the log, in sentences.
+    record: the angles; campaign: its rows as reports show them; findings: what was done to the log, in sentences;
+    step: of the coarsest encoder, rad, zero where none shows.
     """
 
     record: Record
     campaign: Campaign
     findings: tuple[str, ...]
+    step: float
 
 
 def fit_vibration(campaigns: Campaign | Sequence[Campaign], model: GyroModel) -> Estimate:
@@ -106,7 +110,18 @@ def vibration_record(campaigns: Campaign | Sequence[Campaign]) -> VibrationRecor
     units = {"time": "s", "table": "deg", "table_rate": "deg/s"} | dict.fromkeys(GIMBALS, "deg")
     record = laid_out(columns, blocks, scheme, "rad", units)
     record = record._replace(interval=interval, data_hash="+".join(c.digest() for c in campaigns))
-    return VibrationRecord(record, _shown(campaigns[0], columns, np.concatenate(numbers)), tuple(findings))
+    shown = _shown(campaigns[0], columns, np.concatenate(numbers))
+    return VibrationRecord(record, shown, tuple(findings), max(map(_step, campaigns)))
+
+
+def _step(campaign: Campaign) -> float:
+    """The usual distance of neighbouring readings of the coarsest encoder that repeats its readings."""
+    steps = [0.0]
+    for name in GIMBALS:
+        levels = np.unique(campaign.si(name))
+        if 1 < len(levels) < len(campaign) / OFTEN:
+            steps.append(float(np.median(np.diff(levels))))
+    return max(steps)
 
 
 class _Run(NamedTuple):
