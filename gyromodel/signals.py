@@ -279,7 +279,7 @@ def laid_out(
     extra = padded_length(rows) - rows
     columns, output = dict(columns), columns["output"]
     interval, restart = columns.pop("_interval"), columns.pop("_restart")
-    white, start = columns.pop("_white", np.ones(rows)), columns.pop("_start", None)
+    white, start = columns.pop("_white", np.ones(rows)), columns.pop("_start", np.zeros(rows))
     signals = {n: jnp.asarray(np.pad(v, (0, extra), mode="edge")) for n, v in columns.items()}
     present = np.pad(np.isfinite(output), (0, extra))
     sampling = Sampling(
@@ -287,6 +287,6 @@ def laid_out(
         jnp.asarray(np.pad(restart, (0, extra))),
         jnp.asarray(present),
         jnp.asarray(np.pad(white, (0, extra), constant_values=1.0)),
-        None if start is None else jnp.asarray(np.pad(start, (0, extra))),
+        jnp.asarray(np.pad(start, (0, extra))),
     )
     return Record(signals, sampling, rows, float(np.median(interval[~restart])), unit, units, blocks, scheme)

@@ -173,3 +173,23 @@ def test_long_record_keeps_its_precision(rng: np.random.Generator):
     expected = solve_triangular(lower, columns, lower=True)
     assert np.asarray(whiten(filter, jnp.asarray(columns))) == pytest.approx(expected, abs=1e-6)
     assert float(filter.log_determinant) == pytest.approx(2 * np.log(np.diag(lower)).sum(), rel=1e-8)
+
+
+def test_a_constant_of_its_own_takes_away_the_mean(rng: np.random.Generator):
+    """Whitened beside a constant of large variance, data and data plus a constant of each record are the same."""
+    rows = 60
+    restart = np.arange(rows) % 30 == 0
+    sampling = Sampling(
+        jnp.full(rows, 0.5), jnp.asarray(restart), jnp.ones(rows, bool), jnp.ones(rows), jnp.full(rows, 1e6)
+    )
+    noise = MarkovSum(jnp.array([0.0, 0.3]), jnp.array([0.2, 0.5]))
+    dense = covariance(noise, sampling._replace(start=None))
+    dense += 1e6 * (np.cumsum(restart)[:, None] == np.cumsum(restart))
+    x = rng.standard_normal((rows, 1))
+    filter = build_filter(noise, sampling)
+    w = np.asarray(whiten(filter, jnp.asarray(x)))
+    assert (w.T @ w).item() == pytest.approx((x.T @ np.linalg.solve(dense, x)).item(), rel=1e-6)
+    assert float(filter.log_determinant) == pytest.approx(np.linalg.slogdet(dense)[1], rel=1e-8)
+    moved = whiten(filter, jnp.asarray(x + np.cumsum(restart)[:, None]))
+    # Of a constant of 2, the prior of 1000 leaves 2e-3 in the first sample.
+    assert np.asarray(moved) == pytest.approx(w, abs=2.1e-3)
