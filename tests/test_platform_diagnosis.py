@@ -22,6 +22,7 @@ from gyromodel.diagnosis import Diagnosis
 from gyromodel.effects import CATALOGUE
 from gyromodel.effects._base import evaluate
 from gyromodel.effects.platform import ENCODERS, SHAFTS, TILTS, EncoderHarmonic, ShaftFriction
+from gyromodel.files import read_campaign
 from gyromodel.model import GyroModel, ModelError, make_effect, model_from_effects
 from gyromodel.model_files import read_model, write_model
 from gyromodel.platform import fit_vibration, vibration_record
@@ -50,6 +51,7 @@ def values(diagnosis: Diagnosis) -> dict[str, tuple[float, float]]:
     return {f"{row.effect}.{row.name}": (row.value, row.std) for row in diagnosis.extended.table()}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("effect", HIDDEN)
 def test_each_effect_is_named_with_its_size(effect: str, seed: int):
     size, name, expected = HIDDEN[effect]
@@ -60,6 +62,7 @@ def test_each_effect_is_named_with_its_size(effect: str, seed: int):
     assert abs(value - expected) < 5 * std + 0.03 * abs(expected), (value, std, expected)
 
 
+@pytest.mark.long
 def test_another_loop_is_named_where_the_friction_is_known(seed: int):
     diagnosis = found(vibration("loop_dynamics", -0.4, seed), simulation_with_friction())
     assert (diagnosis.verdict, [c.effect for c in diagnosis.causes]) == ("named", ["loop_dynamics"])
@@ -80,6 +83,7 @@ def test_nothing_hidden_is_adequate(known: bool):
     assert names == set(PLATFORM)
 
 
+@pytest.mark.long
 def test_two_effects_are_both_named(seed: int):
     diagnosis = found(late_and_tilted(0.1 * MS, HIDDEN["gimbal_nonorthogonality"][0], seed))
     assert diagnosis.verdict == "named"
@@ -249,3 +253,13 @@ def test_what_is_written_wrong_is_refused():
         ShaftFriction([0.1], shafts=("gimbal_x", "gimbal_z"))
     with pytest.raises(ValueError, match="is no term"):
         EncoderHarmonic([0.0], [0.0], ("gimbal_x/9",))
+
+
+@pytest.mark.long
+def test_what_stands_still_within_a_step_of_the_encoders_is_no_tilt():
+    """The embedded log: late records and friction; its roll gimbal reads the same while the kinematics move it a sixth."""
+    log = read_campaign(Path(gyromodel.__file__).parent / "data" / "platform_vibration.csv.gz")
+    found = gyromodel.diagnose(log, NOTHING, hold_out=False)
+    assert found.verdict == "named"
+    assert {cause.effect for cause in found.causes} == {"sync_delay", "shaft_friction"}
+    assert any("half a step of the encoders" in line for line in found.findings)
