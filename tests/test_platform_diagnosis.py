@@ -257,7 +257,7 @@ def test_what_is_written_wrong_is_refused():
 
 @pytest.mark.long
 def test_what_stands_still_within_a_step_of_the_encoders_is_no_tilt():
-    """The embedded log: late records and friction; its roll gimbal reads the same while the kinematics move it a sixth."""
+    """The embedded log: late records and friction; its roll gimbal stands still while the base moves it by a sixth."""
     log = read_campaign(Path(gyromodel.__file__).parent / "data" / "platform_vibration.csv.gz")
     found = gyromodel.diagnose(log, NOTHING, hold_out=False)
     assert found.verdict == "named"
