@@ -66,10 +66,10 @@ class _Session:
         """The rounds, cut before an effect that is nowhere half a step of the readings large.
 
         Readings of what moves within a step stand still, and a still reading of a moving thing is an error that
-        follows the motion: it is not the noise that the evidence weighs.
+        follows the motion: it is not the noise that the evidence weighs. No step, as of any gyro, cuts nothing.
         """
         for i, (done, estimate) in enumerate(zip(selection.path, selection.estimates[1:], strict=False)):
-            if done.effect is not None and done.effect.label in estimate.model.labels:
+            if step and done.effect is not None and done.effect.label in estimate.model.labels:
                 effect = estimate.model.effects[estimate.model.labels.index(done.effect.label)]
                 size = np.asarray(effect.contribution(self.record.signals))[: self.record.rows]
                 if np.abs(size).max() < 0.5 * step:
