@@ -401,11 +401,13 @@ def units(
     """Tell how the units of an archive spread, which stand out, and which drift."""
     if output:
         refuse_overwriting(output, [results])
-    from gyromodel.batch import pooled_table, read_results, unit_statistics
+    from gyromodel.batch import copies, pooled_table, read_results, unit_statistics
     from gyromodel.batch import write_table as write
 
     table = read_results(results)
     found = unit_statistics(table)
+    if twice := copies(table):
+        print(f"gyromodel: the same data as others, and counted once: {', '.join(twice)}", file=sys.stderr)
     if output:
         output.parent.mkdir(parents=True, exist_ok=True)
         write(pooled_table(table, found), output)

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pytest
 from scipy.stats import binom
 
-from gyromodel.batch import Parameter, pooled_table, unit_statistics
+from gyromodel.batch import Parameter, copies, pooled_table, unit_statistics
 
 
 def drawn(
@@ -25,11 +25,11 @@ def drawn(
     table = {
         "campaign": [f"c{i}" for i in range(n)], "axis": [None] * n, "parameter": ["bias.value"] * n,
         "value": value, "std": std, "unit": ["deg/h"] * n, "serial": [f"U{u}" for u in unit], "date": [None] * n,
-        "status": ["fitted"] * n,
+        "status": ["fitted"] * n, "data_hash": [f"d{i}" for i in range(n)],
     }  # fmt: skip
     return pa.table(table, pa.schema([("campaign", pa.string()), ("axis", pa.string()), ("parameter", pa.string()),
         ("value", pa.float64()), ("std", pa.float64()), ("unit", pa.string()), ("serial", pa.string()),
-        ("date", pa.string()), ("status", pa.string())])), true  # fmt: skip
+        ("date", pa.string()), ("status", pa.string()), ("data_hash", pa.string())])), true  # fmt: skip
 
 
 def statistics(table: pa.Table) -> Parameter:
@@ -120,3 +120,34 @@ def test_units_of_measure_change_nothing_and_failures_are_left_out(seed: int):
 
 def test_one_unit_says_nothing_of_units(seed: int):
     assert unit_statistics(drawn(np.random.default_rng(seed), 1, 3, 1.0, 0.0)[0]) == []
+
+
+def test_copies_of_a_campaign_count_once(seed: int):
+    """Under other names, as a link or a backup has; and what is held fixed, or has no number, does not count."""
+    table, _ = drawn(np.random.default_rng(seed), 6, 2, 1.0, 0.5)
+    again = table.slice(0, 4).set_column(0, "campaign", pa.array([f"copy of c{i}" for i in range(4)]))
+    odd = [table.slice(i, 1).set_column(0, "campaign", pa.array([f"odd{i}"])) for i in range(3)]
+    for i, (name, value) in enumerate((("std", 0.0), ("std", None), ("value", np.nan))):
+        place = table.column_names.index(name)
+        odd[i] = odd[i].set_column(place, name, pa.array([value], pa.float64()))
+        odd[i] = odd[i].set_column(table.column_names.index("data_hash"), "data_hash", pa.array([f"odd{i}"]))
+    whole = pa.concat_tables([table, again, *odd])
+    assert copies(whole) == [f"copy of c{i}" for i in range(4)]
+    first, second = statistics(table), statistics(whole)
+    assert (second.campaigns, second.mean, second.between) == (12, first.mean, first.between)
+    assert pooled_table(whole, [second]).equals(pooled_table(table, [first]))
+
+
+@pytest.mark.parametrize(("units", "campaigns"), [(2, 1), (2, 3)])
+def test_two_units_are_enough(units: int, campaigns: int, seed: int):
+    """The mean of all and what is told of each lie where they should; with two, how far apart units are is a guess."""
+    rng, archives, covered, mean = np.random.default_rng(seed), 120, 0, 0
+    for _ in range(archives):
+        between = rng.choice([0.1, 1.0, 5.0])
+        table, true = drawn(rng, units, campaigns, between, 0.0)
+        found = statistics(table)
+        k = rng.integers(len(true))
+        covered += bool(found.pooled["low"][k] <= true[found.pooled["row"]][k] <= found.pooled["high"][k])
+        mean += abs(found.mean - 40) < 2 * found.mean_std
+        assert not found.outliers
+    assert min(covered, mean) >= binom.ppf(1e-3, archives, 0.93), f"seed {seed}: {covered}, {mean} of {archives}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from gyromodel import CampaignError, cli
+from gyromodel import CampaignError, cli, files
 from gyromodel.batch import Entry, entries, run_batch
 from gyromodel.batch import _results as storage
 from gyromodel.campaign import Campaign
@@ -228,6 +229,77 @@ def test_archives_of_every_kind(tmp_path: Path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(CampaignError, match="no campaign in it"):
         entries(str(tmp_path / "empty"))
+
+
+def test_links_neither_double_nor_lose_a_campaign(tmp_path: Path):
+    place = archive(tmp_path, 2)
+    (tmp_path / "disk").mkdir()
+    write_campaign(campaign(2), tmp_path / "disk" / "d.csv")
+    for name, target in (
+        ("latest.csv", "c000.csv"), ("a", "below"), ("loop", "."), ("disk", "../disk"), ("gone.csv", "no")
+    ):  # fmt: skip
+        (place / name).symlink_to(target)
+    inside = ["below/c001.csv", "c000.csv", "disk/d.csv", "gone.csv"]
+    assert [e.campaign for e in entries(str(place))] == inside
+    assert [e.campaign for e in entries(f"{place}/**/*.csv")] == [f"{place}/{name}" for name in inside]
+    (place / "up").symlink_to("..")
+    (tmp_path / "disk" / "back").symlink_to("../archive")
+    assert [e.campaign for e in entries(str(place))] == inside
+    # The same archive by another path.
+    assert here(tmp_path).examined == 4
+    (tmp_path / "link").symlink_to("archive")
+    for same in (tmp_path / "link", tmp_path / "disk" / ".." / "archive"):
+        done = here(tmp_path, where=same)
+        assert (done.campaigns, done.examined, done.failed) == (4, 1, 1)
+
+
+def test_manifests_of_every_writer(tmp_path: Path):
+    """Texts as pandas, polars and categories hold them; a path twice, however spelled, and none are refused."""
+    place = archive(tmp_path, 1)
+    names = pa.array(["archive/c000.csv"])
+    for kind in (pa.string(), pa.large_string(), pa.string_view(), pa.dictionary(pa.int32(), pa.string())):
+        column = names.dictionary_encode() if isinstance(kind, pa.DictionaryType) else names.cast(kind)
+        parquet.write_table(pa.table({"campaign": column}), tmp_path / "list.parquet")
+        assert entries(str(tmp_path / "list.parquet")) == [Entry("archive/c000.csv", str(place / "c000.csv"))]
+    for other, expected in ((str(place / "c000.csv"), "twice"), ("./archive/c000.csv", "twice"), (None, "row 2 names")):
+        parquet.write_table(pa.table({"campaign": ["archive/c000.csv", other]}), tmp_path / "list.parquet")
+        with pytest.raises(CampaignError, match=expected):
+            entries(str(tmp_path / "list.parquet"))
+
+
+def test_what_could_not_be_read_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A disk that fails is no fault of the campaign, which has not changed when it works again; a bad file is."""
+    place = archive(tmp_path, 2)
+    (place / "bad.csv").write_text("time [s],output [deg/h]\n0,1\n")
+    whole = files._READERS[".csv"]
+
+    def fails(path: Path):
+        if path.name == "c000.csv":
+            raise PermissionError(13, "Permission denied")
+        return whole(path)
+
+    with monkeypatch.context() as patched:
+        patched.setitem(files._READERS, ".csv", fails)
+        assert (here(tmp_path).failed, here(tmp_path).failed) == (2, 2)
+    done = here(tmp_path)
+    assert (done.examined, done.failed) == (1, 1)
+
+
+def test_a_run_that_ends_meanwhile_is_no_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """It removes its lock between the opening and the locking of another: two would then write."""
+    table, whole = tmp_path / "results.parquet", storage.fcntl.flock
+    made_by = {"archive": "a", "model": "m"}
+
+    def late(*arguments: object):
+        shutil.rmtree(tmp_path / ".results.parquet.parts")
+        whole(*arguments)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(storage.fcntl, "flock", late)
+        with pytest.raises(CampaignError, match="another run"):
+            storage.Results(table, made_by).__enter__()
+    with storage.Results(table, made_by):
+        pass
 
 
 def test_axes_and_diagnoses(tmp_path: Path):

@@ -265,21 +265,68 @@ def test_the_plan_for_an_outcome_is_the_best_of_all():
     assert (seen @ choice.best.covariance @ seen.T)[0, 0] == pytest.approx(min(variances), rel=1e-4)
 
 
-def test_rivals_are_told_apart_by_the_part_that_parts_them():
-    """A slope over temperature and one over its rate: soaks show the first alone, and a ramp parts them."""
-    parts = []
-    for name, course in (("cold", np.full(ROWS, 20.0)), ("warm", np.full(ROWS, 60.0)), ("ramp", RAMP)):
-        parts.append(Part(name, ROWS * STEP, mission(temperature=course)))
-    calibration = Calibration(gyro((Bias(),)), np.array([[1.0]]))
+def test_rivals_are_told_apart_by_the_plan_that_parts_them_most(seed: int):
+    """A slope over temperature and one over its rate, of all plans of four parts.
+
+    Δχ² of the rival's fit and the right one's has the mean s² over draws, s their separation: from least squares on
+    columns written out here, of an open bias and one effect.
+    """
+    white, courses = 3e-4, {"cold": np.full(ROWS, 20.0), "mild": np.full(ROWS, 40.0), "ramp": RAMP}
+    parts = [Part(name, ROWS * STEP, mission(temperature=course)) for name, course in courses.items()]
+    calibration = Calibration(GyroModel((Bias(),), {"noise_white": white}), np.array([[1.0]]))
     rivals = [BiasTemperature.id, BiasTemperatureRate.id]
-    choice = best_plan(known(calibration), parts, 3 * ROWS * STEP, "discrimination", rivals=rivals)
-    assert choice.best.times.get("ramp", 0) > 0
-    assert choice.gain == pytest.approx(choice.best.separation / choice.equal.separation) or choice.gain > 1
-    assert choice.best.separation >= choice.equal.separation
-    with pytest.raises(ModelError, match="two rival effects"):
-        best_plan(known(calibration), parts, 3 * ROWS * STEP, "discrimination")
-    with pytest.raises(ModelError, match="fits into"):
-        best_plan(known(calibration), parts, 10.0)
+    choice = best_plan(known(calibration), parts, 4 * ROWS * STEP, "discrimination", rivals=rivals)
+    sigma = white / np.sqrt(STEP)
+    # Typical sizes are 1 deg/h/°C and 1000 deg/h/(°C/s).
+    of = {name: (DEG_H * course, 1000 * DEG_H * np.gradient(course, STEP)) for name, course in courses.items()}
+
+    def shown(times: dict[str, int]) -> list[np.ndarray]:
+        return [np.concatenate([of[name][k] for name, n in times.items() for _ in range(n)]) for k in (0, 1)]
+
+    def misfit(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        x = np.column_stack([np.ones(len(x)), x])
+        return ((y - x @ np.linalg.lstsq(x, y, rcond=None)[0]) ** 2).sum(axis=0) / sigma**2
+
+    def separation(times: dict[str, int]) -> float:
+        a, b = shown(times)
+        return float(np.sqrt(min(misfit(b, a[:, None]), misfit(a, b[:, None]))[0]))
+
+    every = [dict(zip(courses, n, strict=True)) for n in itertools.product(range(5), repeat=3) if sum(n) == 4]
+    assert choice.equal.times == {"cold": 2, "mild": 1, "ramp": 1}
+    assert choice.best.separation == pytest.approx(max(map(separation, every)), rel=1e-3)
+    assert choice.equal.separation == pytest.approx(separation(choice.equal.times), rel=1e-3)
+    assert choice.gain == pytest.approx(choice.best.separation / choice.equal.separation)
+    assert choice.gain > 1.1
+    for plan in (choice.best, choice.equal):
+        mean = []
+        for right, wrong in (shown(plan.times), shown(plan.times)[::-1]):
+            y = right[:, None] + sigma * np.random.default_rng(seed).standard_normal((len(right), 400))
+            change = misfit(wrong, y) - misfit(right, y)
+            mean.append((change.mean(), change.std() / 20))
+        assert min(m for m, _ in mean) == pytest.approx(plan.separation**2, abs=5 * max(e for _, e in mean))
+
+
+def test_plans_that_cannot_be_say_why():
+    line, steps = known(Calibration(gyro(LINE), np.eye(2))), levels([-1, 0, 1])
+    for options, expected in (
+        ({}, "two rival effects"),
+        ({"rivals": ["bias_temperature", "bias_temperature"]}, "two rival effects"),
+        ({"rivals": ["bias", "scale_nonlinearity"]}, "has bias already"),
+        ({"rivals": ["bias_temperature", "scale_nonlinearity"]}, "needs a column temperature"),
+        # Odd in the rate, as the scale factor is on these three rates.
+        ({"rivals": ["scale_sagnac_sine", "scale_asymmetry"]}, "no plan of these candidates"),
+        ({"budget": 10.0}, "fits into"),
+        ({"budget": np.inf}, "more than 10000 times"),
+    ):
+        with pytest.raises(ModelError, match=expected):
+            best_plan(line, steps, **{"budget": 600.0, "criterion": "discrimination", **options})
+    with pytest.raises(ModelError, match="no uncertainty"):
+        best_plan(line, steps, 600.0, "outcome", jacobian=np.zeros((1, 2)))
+
+
+def test_a_calibration_without_errors_has_none_to_draw():
+    for result in sensitivity(thermal(np.zeros((2, 2))), mission(temperature=RAMP), ["angle"]).results:
+        assert (result.budget.std, result.drawn.agrees, result.sobol) == (0.0, True, ())
 
 
 PLAN = """

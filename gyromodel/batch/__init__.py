@@ -3,7 +3,7 @@
 from gyromodel.batch._archive import Entry, entries
 from gyromodel.batch._results import read_results, write_table
 from gyromodel.batch._run import Batch, run_batch
-from gyromodel.batch._units import Drift, Outlier, Parameter, Spread, pooled_table, unit_statistics
+from gyromodel.batch._units import Drift, Outlier, Parameter, Spread, copies, pooled_table, unit_statistics
 
 __all__ = [
     "Batch",
@@ -12,6 +12,7 @@ __all__ = [
     "Outlier",
     "Parameter",
     "Spread",
+    "copies",
     "entries",
     "pooled_table",
     "read_results",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
@@ -37,7 +38,8 @@ def entries(archive: str, but: Path | None = None) -> list[Entry]:
     Args:
         archive: a folder, searched with all below it but what is hidden; a pattern such as `2024/*/rate_*.csv.gz`, with
             `**` for folders of any depth; a Zarr group that holds campaigns as groups; a Parquet file with a column
-            `campaign` of paths, relative to it; or a single campaign.
+            `campaign` of paths, relative to it; or a single campaign. A link to what the archive has anyway, such as
+            one named `latest`, is no further campaign.
         but: a file that is left out, such as the results.
 
     Raises:
@@ -54,32 +56,50 @@ def entries(archive: str, but: Path | None = None) -> list[Entry]:
     elif root.is_file():
         found = [Entry(root.name, str(root.resolve()))]
     else:
-        found = sorted(Entry(name, str(Path(name).resolve())) for name in glob.glob(archive, recursive=True))
+        found = _each_once(Path(name) for name in glob.glob(archive, recursive=True))
         if not found and not glob.has_magic(archive):
             raise CampaignError(f"{archive}: there is no such folder or file")
     if but is not None:
         found = [entry for entry in found if Path(entry.path) != but.resolve()]
     if not found:
         raise CampaignError(f"{archive}: there is no campaign in it (looked for names ending in {', '.join(SUFFIXES)})")
-    names = [entry.campaign for entry in found]
-    if twice := next((name for name in names if names.count(name) > 1), None) if len({*names}) < len(names) else None:
+    times = Counter(entry.path for entry in found)
+    if twice := next((entry.campaign for entry in found if times[entry.path] > 1), None):
         raise CampaignError(f"{archive}: names {twice} twice")
     return found
 
 
 def _named(paths: Iterable[Path], root: Path) -> list[Entry]:
-    return sorted(Entry(path.relative_to(root).as_posix(), str(path.resolve())) for path in paths)
+    return [Entry(Path(name).relative_to(root).as_posix(), path) for name, path in _each_once(paths)]
+
+
+def _each_once(paths: Iterable[Path]) -> list[Entry]:
+    """Sorted by name; what several names lead to has that without a link, else the one of the fewest folders."""
+    found: dict[str, tuple[bool, int, str]] = {}
+    for path in paths:
+        real = os.path.realpath(path)
+        name = os.path.abspath(path) != real, len(path.parts), str(path)
+        found[real] = min(name, found.get(real, name))
+    return sorted(Entry(name, real) for real, (_, _, name) in found.items())
 
 
 def _campaigns_below(root: Path) -> list[Path]:
-    found = []
-    for folder, folders, names in os.walk(root):
+    found, top, seen = [], os.path.realpath(root), set[str]()
+    for folder, folders, names in os.walk(root, followlinks=True):
         here = Path(folder)
         groups = [name for name in folders if is_zarr(here / name)]
         found += [path for name in groups for path in _groups_below(here / name)]
-        folders[:] = [name for name in folders if not name.startswith(".") and name not in groups]
+        folders[:] = [name for name in sorted(folders) if not name.startswith(".") and name not in groups]
+        links = {name: os.path.realpath(here / name) for name in folders if (here / name).is_symlink()}
+        folders[:] = [n for n in folders if n not in links or not (links[n] in seen or _nested(top, links[n]))]
+        seen |= {*links.values()}
         found += [here / name for name in names if name.lower().endswith(SUFFIXES) and not name.startswith(".")]
     return found
+
+
+def _nested(one: str, other: str) -> bool:
+    """Whether a folder lies in the other: a link from it to there leads to nothing new, or round in circles."""
+    return os.path.commonpath([one, other]) in (one, other)
 
 
 def _groups_below(root: Path) -> list[Path]:
@@ -105,6 +125,11 @@ def _manifest(path: Path) -> list[str] | None:
         schema = parquet.read_schema(path)
     except (pa.ArrowException, OSError) as error:
         raise CampaignError(f"{path}: is no Parquet file, or is damaged") from error
-    if "campaign" not in schema.names or not pa.types.is_string(schema.field("campaign").type):
+    kind = schema.field("campaign").type if "campaign" in schema.names else pa.null()
+    kind = kind.value_type if isinstance(kind, pa.DictionaryType) else kind
+    if kind not in (pa.string(), pa.large_string(), pa.string_view()):
         return None
-    return [str(name) for name in parquet.read_table(path, columns=["campaign"])["campaign"].to_pylist()]
+    names = parquet.read_table(path, columns=["campaign"])["campaign"].to_pylist()
+    if not all(names):
+        raise CampaignError(f"{path}: row {next(i for i, name in enumerate(names, 1) if not name)} names no campaign")
+    return names

@@ -52,25 +52,38 @@ class Results:
         self._written = 0.0
 
     def __enter__(self) -> Self:
+        # A table that cannot be continued is refused before anything is made beside it.
         if self.path.exists():
-            self._tables.append(self._read(self.path))
+            self._read(self.path)
         self._folder.mkdir(parents=True, exist_ok=True)
         self._lock = open(self._folder / "lock", "w")
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+            self._begin()
+        except BaseException:
             self._lock.close()
-            raise CampaignError(f"{self.path}: another run is writing it") from None
+            raise
+        return self
+
+    def _begin(self) -> None:
+        """Take the lock, and then read what there is: a run that ends meanwhile has written another table."""
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # The other run takes its lock away when it ends, and may do so between those two steps.
+            same = os.path.samestat(os.fstat(self._lock.fileno()), os.stat(self._lock.name))
+        except OSError:
+            same = False
+        if not same:
+            raise CampaignError(f"{self.path}: another run is writing it")
+        if self.path.exists():
+            self._tables.append(self._read(self.path))
         for part in sorted(self._folder.glob("*.parquet")):
             try:
                 self._tables.append(self._read(part))
             except CampaignError:
                 if self._made_otherwise(part):
-                    self._lock.close()
                     raise
                 part.unlink()  # cut short with the machine
         self._next = 1 + max((int(part.stem) for part in self._folder.glob("*.parquet")), default=0)
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None):
         """Keep what is finished, whatever ended the run."""
@@ -80,7 +93,7 @@ class Results:
             self._lock.close()
 
     def finished(self) -> dict[str, str]:
-        """The state in which each campaign was examined, by its name."""
+        """The state in which each campaign was examined, by its name; empty where that has to be done again."""
         states: dict[str, str] = {}
         for table in self._tables:
             states |= zip(table["campaign"].to_pylist(), table["file_state"].to_pylist(), strict=True)

@@ -55,7 +55,8 @@ def run_batch(
     """Fit, or diagnose, every campaign of an archive and write one table.
 
     A campaign that cannot be read or fitted is a row with the reason. Campaigns that an earlier run has finished, and
-    that have not changed since, are not examined again; those that are gone from the archive leave the table.
+    that have not changed since, are not examined again, unless the machine was at fault and not the data; those that
+    are gone from the archive leave the table.
 
     Args:
         archive: see `entries`.
@@ -73,7 +74,7 @@ def run_batch(
     every = entries(archive, but=results)
     task = "diagnose" if diagnosing else "fit"
     made_by = {
-        "archive": str(Path(archive).absolute()),
+        "archive": str(Path(archive).resolve()),
         "model": model_hash,
         "version": gyromodel.__version__,
         "task": task,
@@ -81,7 +82,7 @@ def run_batch(
     with Results(results, made_by) as kept:
         finished = kept.finished()
         states = {entry: entry.state for entry in every}
-        todo = [entry for entry in every if finished.get(entry.campaign) != states[entry]]
+        todo = [entry for entry in every if not states[entry] or finished.get(entry.campaign) != states[entry]]
         tasks = [(entry, states[entry], model, model_hash, diagnosing) for entry in todo]
         say = _Pace(progress, len(every), len(every) - len(todo))
         spread = _on_cluster(tasks, workers, scheduler) if workers > 1 or scheduler else _here(tasks)

@@ -114,7 +114,7 @@ def pooled_table(results: pa.Table, statistics: Sequence[Parameter]) -> pa.Table
 def unit_statistics(results: pa.Table) -> list[Parameter]:
     """Statistics of every parameter with standard uncertainties in a table of results.
 
-    Campaigns of one `serial` are of one unit, and one without is of a unit of its own.
+    Campaigns of one `serial` are of one unit, and one without is of a unit of its own. `copies` count once.
 
     Args:
         results: as `run_batch` writes them.
@@ -123,6 +123,13 @@ def unit_statistics(results: pa.Table) -> list[Parameter]:
         One entry for each parameter, and axis, that two units or more have.
     """
     return [found for rows in _by_parameter(results) if (found := _statistics(rows)) is not None]
+
+
+def copies(results: pa.Table) -> list[str]:
+    """Campaigns that hold the very data of one before them, metadata included, as copies of a file do."""
+    first: dict[str, str] = {}
+    each = dict(zip(results["campaign"].to_pylist(), results["data_hash"].to_pylist(), strict=True))
+    return [name for name, digest in each.items() if digest and first.setdefault(digest, name) != name]
 
 
 class _Rows(NamedTuple):
@@ -143,7 +150,8 @@ def _by_parameter(results: pa.Table) -> Iterator[_Rows]:
     frame = results.select(
         ["campaign", "axis", "parameter", "value", "std", "unit", "serial", "date", "status"]
     ).to_pandas()
-    frame = frame[(frame["status"] != "failed") & (frame["std"] > 0) & np.isfinite(frame["value"])]
+    usable = (frame["status"] != "failed") & (frame["std"] > 0) & np.isfinite(frame["value"])
+    frame = frame[usable & ~frame["campaign"].isin(copies(results))]
     frame["serial"] = frame["serial"].where(frame["serial"].notna(), frame["campaign"])
     frame["axis"] = frame["axis"].fillna("")
     for (parameter, axis, unit_text), part in frame.groupby(["parameter", "axis", "unit"], sort=False):

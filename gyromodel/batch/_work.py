@@ -87,11 +87,13 @@ def _parameters(head: Row, estimate: Estimate) -> list[Row]:
 
 
 def failed(head: Row, error: Exception) -> Row:
-    """The row of a campaign without a result."""
+    """The row of a campaign without a result; without its state, if another run may have one of the same data."""
     reason = " ".join(str(error).split())
     if not isinstance(error, REFUSALS):
         reason = f"internal error ({type(error).__name__}: {reason[:200]})"
-    return head | {"status": "failed", "reason": reason}
+    elif not isinstance(error.__cause__, OSError):
+        return head | {"status": "failed", "reason": reason}
+    return head | {"status": "failed", "reason": reason, "file_state": ""}
 
 
 def _known(value: Any) -> float | None:

@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from gyromodel._checks import CampaignError
 from gyromodel.campaign import Campaign
 from gyromodel.effects import Effect
-from gyromodel.model import ModelError, make_effect
+from gyromodel.model import GyroModel, ModelError, make_effect
 from gyromodel.plan import planned
 from gyromodel.signals import read_signals
 from gyromodel.study._known import Known
@@ -31,6 +31,14 @@ Criterion = Literal["parameters", "outcome", "discrimination"]
 VAGUE = 1e5
 # Relative gain of a score from which an exchange counts.
 LEAST_GAIN = 1e-9
+# Parts of one plan: what is done more often is a longer part.
+MOST_PARTS = 10_000
+# What is left of an effect, squared and relative to the whole, that its rival takes to rounding.
+ROUNDING = 1e-9
+# Stands for zero where a logarithm is taken.
+LEAST = 1e-300
+# Added to a diagonal of ones: a rival that a plan shows nothing of takes nothing.
+SINGULAR = 1e-12
 
 
 class Part(NamedTuple):
@@ -153,13 +161,20 @@ def best_plan(
     durations = np.array([part.duration for part in parts])
     if not (durations <= budget).any():
         raise ModelError(f"no candidate fits into {budget:g} s; the shortest takes {durations.min():g} s")
+    if budget > MOST_PARTS * durations.min():
+        raise ModelError(
+            f"{budget:g} s hold the shortest candidate, of {durations.min():g} s, more than {MOST_PARTS} times: give "
+            "longer parts, or less time"
+        )
     if criterion == "outcome" and jacobian is None:
         raise ModelError("a plan for an outcome needs its derivative")
-    if criterion == "discrimination" and (len(rivals) < 2 or len(known.models) > 1):
+    if criterion == "discrimination" and (len({*rivals}) < 2 or len(known.models) > 1):
         raise ModelError("a plan that tells effects apart needs two rival effects or more, and one gyro")
+    if already := {*rivals} & {label for model in known.models for label in model.labels}:
+        raise ModelError(f"the model has {min(already)} already: rivals are effects that it lacks")
     joint = read_signals([with_known_output(part.campaign, i) for i, part in enumerate(parts)])
     models = tuple(model.prepared(joint.signals) for model in known.models)
-    effects = [make_effect(label).prepared(joint.signals) for label in rivals]
+    effects = GyroModel(tuple(map(make_effect, rivals))).prepared(joint.signals).effects
     told = np.stack([
         blocks([information(m, part.campaign, instruments, rivals=effects) for m in models]) for part in parts
     ])  # fmt: skip
@@ -179,11 +194,15 @@ def best_plan(
     def plan(n: np.ndarray) -> TestPlan:
         total = np.tensordot(n, told, 1)
         covariance = covariance_after(errors, total[:count, :count])
-        apart = float(separation(total[None])[0]) if separation else np.nan
+        apart = float(np.exp(separation(total[None])[0] / 2)) if separation else np.nan
         times = {part.name: int(k) for part, k in zip(parts, n, strict=True) if k}
         return TestPlan(times, float(n @ durations), covariance, apart)
 
     after, before = (float(score(np.tensordot(n, told, 1)[None])[0]) for n in (best, start))
+    if criterion == "discrimination" and after <= np.log(LEAST):
+        raise ModelError(f"no plan of these candidates tells {' and '.join(rivals)} apart: add another part")
+    if criterion == "outcome" and after >= -np.log(LEAST):
+        raise ModelError("the outcome has no uncertainty that a test could lessen")
     # Scores are ln det of the information, minus ln variance, and ln separation squared.
     gain = np.exp((after - before) / (2.0 * (count if criterion == "parameters" else 1)))
     return PlanChoice(criterion, plan(best), plan(start), float(gain))
@@ -207,7 +226,7 @@ def _score(
 
         def known_well(told: np.ndarray) -> np.ndarray:
             left = np.linalg.solve(inner(told), np.broadcast_to(gram, (len(told), *gram.shape)))
-            return -np.log(np.trace(left, axis1=1, axis2=2))
+            return -np.log(np.maximum(np.trace(left, axis1=1, axis2=2), LEAST))
 
         return known_well
     sizes = [typical(effect) for effect in effects]
@@ -221,19 +240,19 @@ def _score(
                 if b is a:
                     continue
                 # What neither the parameters, as far as they are open, nor the rival take of the effect.
-                open_ = np.concatenate([errors, np.zeros((len(b), errors.shape[1]))])
-                free = np.zeros((len(open_), len(b)))
-                rows = np.concatenate([np.arange(count), b])
-                own = np.sqrt(told[:, b, b].max() + 1e-300)
-                free[count:] = np.eye(len(b)) * VAGUE / own
-                span = np.concatenate([open_, free], axis=1)
-                seen = span.T @ told[:, rows][:, :, a] @ size
-                taken = np.linalg.solve(
-                    np.eye(span.shape[1]) + span.T @ told[:, rows][:, :, rows] @ span, seen[:, :, None]
-                )
+                rows, known = np.concatenate([np.arange(count), b]), errors.shape[1]
+                span = np.zeros((len(rows), known + len(b)))
+                span[:count, :known], span[count:, known:] = errors, np.eye(len(b))
+                gram = span.T @ told[:, rows][:, :, rows] @ span
+                gram[:, np.arange(known), np.arange(known)] += 1.0
+                scale = np.sqrt(np.maximum(np.einsum("nii->ni", gram), 1e-300))
+                gram = gram / (scale[:, :, None] * scale[:, None]) + SINGULAR * np.eye(len(span.T))
+                seen = span.T @ told[:, rows][:, :, a] @ size / scale
+                taken = np.linalg.solve(gram, seen[:, :, None])[:, :, 0]
                 whole = np.einsum("i,nij,j->n", size, told[:, a][:, :, a], size)
-                least = np.minimum(least, whole - np.einsum("ni,ni->n", seen, taken[:, :, 0]))
-        return np.log(np.maximum(least, 1e-300))
+                left = whole - np.einsum("ni,ni->n", seen, taken)
+                least = np.minimum(least, np.where(left > ROUNDING * whole, left, 0.0))
+        return np.log(np.maximum(least, LEAST))
 
     return apart
 
@@ -286,9 +305,8 @@ def _exchanged(
                     tried.append(n + room * (np.arange(len(times)) == j))
         if not tried:
             return times
-        scores = of(tried)
-        at = int(np.argmax(scores))
-        if not scores[at] > now + LEAST_GAIN * max(abs(now), 1.0):
+        other = filled(tried[int(np.argmax(of(tried)))])
+        then = of([other])[0]
+        if not then > now + LEAST_GAIN * max(abs(now), 1.0):
             return times
-        times = filled(tried[at])
-        now = of([times])[0]
+        times, now = other, then
