@@ -21,6 +21,8 @@ from pyarrow import parquet
 from gyromodel import CampaignError, cli, files
 from gyromodel.batch import Entry, entries, run_batch
 from gyromodel.batch import _results as storage
+from gyromodel.batch import _run as running
+from gyromodel.batch import _work as work
 from gyromodel.campaign import Campaign
 from gyromodel.estimate import fit
 from gyromodel.files import write_campaign
@@ -93,17 +95,72 @@ def test_every_row_is_what_fit_finds(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert mine["noise_white"]["low"] < mine["noise_white"]["value"] < mine["noise_white"]["high"]
 
 
+STATED = """effects: [{effect: bias}, {effect: bias_temperature}]
+noise: [{effect: noise_white, value: 0.0028 deg/sqrt(h)}, {effect: noise_random_walk, value: 0.02 deg/h/sqrt(h)}]
+"""
+
+
+def test_stated_noise_is_fitted_together_as_each_by_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Of two lengths, with three axes of which one is dead, samples missing, and one file that is none."""
+    place = archive(tmp_path, 5)
+    (tmp_path / "model.yaml").write_text(STATED)
+    start, one, columns = read_model(tmp_path / "model.yaml"), campaign(7), dict(campaign(8).columns)
+    three = one.without("output")
+    for axis, values in zip("xyz", (one.columns["output"], 2 - one.columns["output"], np.zeros(len(one))), strict=True):
+        three = three.with_column(f"output_{axis}", values, "deg/h")
+    write_campaign(three, place / "three.csv")
+    columns["output"] = np.where(np.arange(60) % 9 == 4, np.nan, columns["output"])
+    gaps = Campaign(columns, campaign(8).units, campaign(8).metadata)
+    write_campaign(gaps, place / "gaps.csv")
+    # No temperature to tell the slope by: the sentence is that of the fit by itself.
+    write_campaign(campaign(9).with_column("temperature", np.full(64, 20.0), "degC"), place / "still.csv")
+    (place / "bad.csv").write_text("time [s],output [deg/h]\n0,1\n")
+    by_themselves = []
+    monkeypatch.setattr(work, "fit", lambda c, m: by_themselves.append(c.name) or fit(c, m))
+    done = here(tmp_path)
+    assert by_themselves == ["still"]
+    reasons = {r["campaign"]: r["reason"] for r in done.table.to_pylist() if r["status"] == "failed"}
+    assert "bias_temperature" in reasons.pop("still.csv")
+    assert set(reasons) == {"bad.csv", "three.csv"}
+    measured = {("c000.csv", None): campaign(0), ("below/c003.csv", None): campaign(3), ("gaps.csv", None): gaps}
+    measured |= {("three.csv", axis): three.axis(axis) for axis in "xy"}
+    for (name, axis), data in measured.items():
+        estimate = fit(data, start)
+        mine = {r["parameter"]: r for r in done.table.to_pylist() if (r["campaign"], r["axis"]) == (name, axis)}
+        assert len(mine) == 4
+        for row in estimate.table():
+            stored = mine[f"{row.effect}.{row.name}"]
+            assert abs(stored["value"] - row.value) < 1e-4 * row.std
+            assert (stored["std"], stored["unit"]) == (pytest.approx(row.std, rel=1e-6), row.unit)
+            assert stored["samples"] == estimate.record.present.sum()
+        for noise, found in estimate.noise_table().items():
+            stored = mine[noise]
+            assert (stored["value"], stored["low"], stored["high"]) == (found["value"], found["lo"], found["hi"])
+
+
+def test_lots_are_of_a_size_in_memory():
+    """Neighbours, the large ones by themselves, none lost."""
+    many = [Entry(f"{k:03d}", f"/{k}") for k in range(100)]
+    states = {e: f"{(40 << 20) if k == 50 else 1000}-1" for k, e in enumerate(many)} | {many[99]: ""}
+    lots = list(running._parted(many, states, 32))
+    assert [e for lot in lots for e in lot] == many
+    assert [many[50]] in lots
+    assert max(map(len, lots)) == 32
+    assert len(lots) <= 5
+    assert list(running._parted(many[:3], states, 1)) == [[e] for e in many[:3]]
+
+
 def test_a_killed_run_goes_on_where_it_was(tmp_path: Path):
     archive(tmp_path, 40)
     whole = here(tmp_path, "whole.parquet").table
     command = [sys.executable, "-m", "gyromodel", "batch", str(tmp_path / "archive")]
     options = ["--model", str(tmp_path / "model.yaml"), "-o", str(tmp_path / "results.parquet")]
-    running = subprocess.Popen([*command, *options])
+    process = subprocess.Popen([*command, *options])
     parts = tmp_path / ".results.parquet.parts"
-    while running.poll() is None and not list(parts.glob("*.parquet")):
+    while process.poll() is None and not list(parts.glob("*.parquet")):
         time.sleep(0.02)
-    running.send_signal(signal.SIGKILL)
-    assert running.wait() == -signal.SIGKILL
+    process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
     assert not (tmp_path / "results.parquet").exists()
     finished = {row["campaign"] for part in parts.glob("*.parquet") for row in parquet.read_table(part).to_pylist()}
     assert finished
@@ -188,15 +245,15 @@ def test_a_worker_that_dies_loses_nothing(tmp_path: Path):
     archive(tmp_path, 24)
     command = [sys.executable, "-m", "gyromodel", "batch", str(tmp_path / "archive"), "--workers", "2", "--json"]
     options = ["--model", str(tmp_path / "model.yaml"), "-o", str(tmp_path / "results.parquet")]
-    running = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     parts = tmp_path / ".results.parquet.parts"
-    while running.poll() is None and not list(parts.glob("*.parquet")):
+    while process.poll() is None and not list(parts.glob("*.parquet")):
         time.sleep(0.02)
-    workers = [p for p in psutil.Process(running.pid).children(recursive=True) if "spawn_main" in " ".join(p.cmdline())]
+    workers = [p for p in psutil.Process(process.pid).children(recursive=True) if "spawn_main" in " ".join(p.cmdline())]
     assert len(workers) == 2
     workers[0].kill()
-    out, said = running.communicate(timeout=120)
-    assert running.returncode == 0, said
+    out, said = process.communicate(timeout=120)
+    assert process.returncode == 0, said
     assert json.loads(out)["campaigns"] == 24
     rows = table(tmp_path)
     assert {row["status"] for row in rows} == {"fitted"}

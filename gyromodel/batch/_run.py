@@ -5,10 +5,10 @@ from __future__ import annotations
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from itertools import islice
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,18 +18,17 @@ import gyromodel
 from gyromodel._checks import CampaignError
 from gyromodel.batch._archive import Entry, entries
 from gyromodel.batch._results import Results
-from gyromodel.batch._work import Row, examine, failed, read
+from gyromodel.batch._work import Lot, Row, examine, failed, read
 from gyromodel.model import GyroModel
 
-# Tasks that wait at each worker, so that none is idle, and times that a task may lose its worker.
+# Lots that wait at each worker, so that none is idle, and times that one may lose its worker.
 WAITING, LOST = 4, 3
+# Campaigns, and bytes of their files, that are read and fitted in one go.
+MOST, LARGEST = 32, 16 << 20
 # Seconds in which a scheduler has to answer.
 PATIENCE = 10
 # Seconds over which the rate of work is averaged.
 RECENT = 60.0
-
-# What `examine` is given.
-Task = tuple[Entry, str, GyroModel, str, bool]
 
 
 class Batch(NamedTuple):
@@ -83,12 +82,17 @@ def run_batch(
         finished = kept.finished()
         states = {entry: entry.state for entry in every}
         todo = [entry for entry in every if not states[entry] or finished.get(entry.campaign) != states[entry]]
-        tasks = [(entry, states[entry], model, model_hash, diagnosing) for entry in todo]
+        # What takes longer by itself than reading does is kept apart: finished work is on disk within a second.
+        most = 1 if diagnosing or not model.noise else MOST
+        lots = [
+            Lot(tuple(some), tuple(states[entry] for entry in some), model, model_hash, diagnosing)
+            for some in _parted(todo, states, most)
+        ]
         say = _Pace(progress, len(every), len(every) - len(todo))
-        spread = _on_cluster(tasks, workers, scheduler) if workers > 1 or scheduler else _here(tasks)
-        for rows in spread:
+        spread = _on_cluster(lots, workers, scheduler) if workers > 1 or scheduler else _here(lots)
+        for lot, rows in spread:
             kept.add(rows)
-            say.one_more()
+            say.more(len(lot.entries))
         table = kept.merge(every)
     lost = {
         name
@@ -98,18 +102,32 @@ def run_batch(
     return Batch(table, len(every), len(todo), len(lost))
 
 
-def _here(tasks: Sequence[Task]) -> Iterator[list[Row]]:
-    """Rows of each task; a thread reads the next campaigns meanwhile."""
+def _parted(todo: Sequence[Entry], states: Mapping[Entry, str], most: int) -> Iterator[list[Entry]]:
+    """Neighbours, so many at most, and of files that are not too large together."""
+    some, size = list[Entry](), 0
+    for entry in todo:
+        own = int(states[entry].partition("-")[0] or 0)
+        if some and (len(some) == most or size + own > LARGEST):
+            yield some
+            some, size = [], 0
+        some.append(entry)
+        size += own
+    if some:
+        yield some
+
+
+def _here(lots: Sequence[Lot]) -> Iterator[tuple[Lot, list[Row]]]:
+    """Rows of each lot; a thread reads the next one meanwhile."""
     with ThreadPoolExecutor(1) as reader:
-        ahead = deque(reader.submit(read, task[0]) for task in tasks[:WAITING])
-        for i, task in enumerate(tasks):
-            if i + WAITING < len(tasks):
-                ahead.append(reader.submit(read, tasks[i + WAITING][0]))
-            yield examine(*task, ahead.popleft().result())
+        ahead = reader.submit(read, lots[0]) if lots else None
+        for lot, following in zip_longest(lots, lots[1:]):
+            axes = ahead.result() if ahead else None
+            ahead = reader.submit(read, following) if following else None
+            yield lot, examine(lot, axes)
 
 
-def _on_cluster(tasks: Sequence[Task], workers: int, scheduler: str | None) -> Iterator[list[Row]]:
-    """Rows of each task as it ends, whatever becomes of single workers."""
+def _on_cluster(lots: Sequence[Lot], workers: int, scheduler: str | None) -> Iterator[tuple[Lot, list[Row]]]:
+    """Rows of each lot as it ends, whatever becomes of single workers."""
     from dask.config import set as configured
     from distributed import Client, LocalCluster, as_completed
 
@@ -121,22 +139,26 @@ def _on_cluster(tasks: Sequence[Task], workers: int, scheduler: str | None) -> I
             client = open_ones.enter_context(Client(scheduler or cluster, timeout=PATIENCE))
         except OSError:
             raise CampaignError(f"{scheduler}: no Dask scheduler answers there within {PATIENCE} s") from None
-        waiting, of = iter(tasks), {}
+        waiting, of = deque(lots), {}
 
         def submitted(count: int) -> list[Any]:
-            new = {client.submit(examine, *task, pure=False): task for task in islice(waiting, count)}
-            of.update({future.key: task for future, task in new.items()})
+            some = [waiting.popleft() for _ in range(min(count, len(waiting)))]
+            new = {client.submit(examine, lot, pure=False): lot for lot in some}
+            of.update({future.key: lot for future, lot in new.items()})
             return list(new)
 
         ahead = WAITING * max(workers, len(client.scheduler_info()["workers"]))
         running = as_completed(submitted(ahead))
         for future in running:
-            entry, state, _, model_hash, _ = of.pop(future.key)
+            lot = of.pop(future.key)
             if future.status == "finished":
-                yield future.result()
+                yield lot, future.result()
+            elif len(lot.entries) > 1:
+                # One of them may be what no worker survives.
+                both = zip(lot.entries, lot.states, strict=True)
+                waiting += [lot._replace(entries=(entry,), states=(state,)) for entry, state in both]
             else:
-                head = {"campaign": entry.campaign, "model_hash": model_hash, "file_state": state}
-                yield [failed(head | {"version": gyromodel.__version__}, future.exception())]
+                yield lot, [failed(lot.heads()[0], future.exception())]
             running.update(submitted(1))
 
 
@@ -145,16 +167,17 @@ class _Pace:
 
     def __init__(self, progress: Callable[[str, float], None] | None, total: int, done: int) -> None:
         self._progress, self._total, self._done = progress, total, done
-        self._times = [time.monotonic()]
+        self._past = [(time.monotonic(), done)]
 
-    def one_more(self) -> None:
-        self._done += 1
+    def more(self, count: int) -> None:
+        self._done += count
         if self._progress is None:
             return
         now = time.monotonic()
-        self._times = [t for t in self._times if now - t < RECENT] or self._times[-1:]
-        rate = len(self._times) / max(now - self._times[0], 1e-3)
-        self._times.append(now)
+        self._past = [(t, done) for t, done in self._past if now - t < RECENT] or self._past[-1:]
+        since, done = self._past[0]
+        rate = (self._done - done) / max(now - since, 1e-3)
+        self._past.append((now, self._done))
         left = (self._total - self._done) / rate
         clock = f"{int(left // 3600)}:{int(left // 60) % 60:02d}:{int(left) % 60:02d}"
         self._progress(f"{self._done}/{self._total}, {rate:.3g}/s, {clock} left", self._done / self._total)

@@ -1,18 +1,22 @@
-"""What is done with one campaign of an archive: read, fit or diagnose, and tell the result in rows."""
+"""What is done with some campaigns of an archive: read, fit or diagnose, and tell the results in rows."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
 
 import gyromodel
 from gyromodel._checks import CampaignError
 from gyromodel.batch._archive import Entry
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis import diagnose
-from gyromodel.estimate import Estimate, EstimateError, fit
+from gyromodel.estimate import EstimateError, calibration_of, fit, fit_many, noise_table, read_for_fit
 from gyromodel.files import read_campaign
 from gyromodel.model import GyroModel, ModelError
+from gyromodel.signals import Record
 from gyromodel.units import UnitError
 
 Row = dict[str, Any]
@@ -20,69 +24,133 @@ Row = dict[str, Any]
 REFUSALS = (CampaignError, EstimateError, ModelError, UnitError)
 
 
-def read(entry: Entry) -> Campaign | Exception:
-    """The campaign, or why it cannot be read."""
+# Rows beyond which a campaign is fitted by itself: those fitted together are held in memory side by side.
+LONGEST = 1 << 16
+
+
+class Lot(NamedTuple):
+    """Campaigns examined in one go, with the states in which they were found, and what is done with them."""
+
+    entries: tuple[Entry, ...]
+    states: tuple[str, ...]
+    model: GyroModel
+    model_hash: str
+    diagnosing: bool
+
+    def heads(self) -> list[Row]:
+        """What is known of each before it is read."""
+        made_by = {"model_hash": self.model_hash, "version": gyromodel.__version__}
+        both = zip(self.entries, self.states, strict=True)
+        return [{"campaign": entry.campaign, "file_state": state} | made_by for entry, state in both]
+
+
+class Ready(NamedTuple):
+    """One axis of a campaign: what its rows begin with, its data or why there are none, and what is fitted together."""
+
+    head: Row
+    campaign: Campaign | Exception
+    record: Record | None
+
+
+def read(lot: Lot) -> list[Ready]:
+    """Every axis of every campaign, with its signals where the fits are made together."""
+    found = []
+    for entry, head in zip(lot.entries, lot.heads(), strict=True):
+        try:
+            campaign = read_campaign(entry.path)
+        except Exception as error:
+            found.append(Ready(head, error, None))
+            continue
+        head["data_hash"] = campaign.digest()
+        head |= {key: str(campaign.metadata[key]) for key in ("serial", "date") if key in campaign.metadata}
+        if campaign.outputs in ((), ("output",)):
+            found.append(_ready(head, campaign, lot))
+            continue
+        for axis in (name.removeprefix("output_") for name in campaign.outputs):
+            try:
+                found.append(_ready(head | {"axis": axis}, campaign.axis(axis), lot))
+            except CampaignError as error:
+                found.append(Ready(head | {"axis": axis}, error, None))
+    return found
+
+
+def _ready(head: Row, campaign: Campaign, lot: Lot) -> Ready:
+    """Noise that is not stated takes nearly all of a fit's time, and is found one campaign at a time anyway."""
+    if lot.diagnosing or not lot.model.noise or len(campaign) > LONGEST:
+        return Ready(head, campaign, None)
     try:
-        return read_campaign(entry.path)
-    except Exception as error:
-        return error
+        return Ready(head, campaign, read_for_fit([campaign]))
+    except Exception:  # by itself it says why
+        return Ready(head, campaign, None)
 
 
-def examine(
-    entry: Entry,
-    state: str,
-    model: GyroModel,
-    model_hash: str,
-    diagnosing: bool,
-    campaign: Campaign | Exception | None = None,
-) -> list[Row]:
-    """Rows of one campaign, which is read if need be: one for each parameter, or one that says why there is none."""
-    head = {"campaign": entry.campaign, "model_hash": model_hash, "version": gyromodel.__version__, "file_state": state}
-    campaign = read(entry) if campaign is None else campaign
+def examine(lot: Lot, axes: Sequence[Ready] | None = None) -> list[Row]:
+    """Rows of some campaigns, in their order: one for each parameter, or one that says why there is none.
+
+    Args:
+        lot: the campaigns.
+        axes: what `read` made of them, if it has.
+    """
+    axes = read(lot) if axes is None else axes
+    together = _together(axes, lot.model)
+    return [row for i, one in enumerate(axes) for row in together.get(i) or _rows(one, lot)]
+
+
+def _together(axes: Sequence[Ready], model: GyroModel) -> dict[int, list[Row]]:
+    """Rows, by place, of fits that one program makes as `fit` makes each.
+
+    One that fails, or whose misfit may be that of another minimum than `fit` would find, is left to that.
+    """
+    records = {i: one.record for i, one in enumerate(axes) if one.record is not None}
+    if not records:
+        return {}
+    fits = fit_many(records.values(), model, restarts=False)
+    may_differ = any(not slot.linear for slot in model.slots())
+    found = {}
+    for k, (i, record) in enumerate(records.items()):
+        if fits.converged[k] and not (may_differ and fits.bad[k]):
+            found[i] = _parameters(
+                axes[i].head | {"status": "fitted"}, record, fits.model(k), fits.covariance[k], int(fits.iterations[k])
+            )
+    return found
+
+
+def _rows(one: Ready, lot: Lot) -> list[Row]:
+    """Rows of one axis of a campaign that is fitted or diagnosed by itself."""
+    head, campaign = one.head, one.campaign
     if isinstance(campaign, Exception):
         return [failed(head, campaign)]
-    head["data_hash"] = campaign.digest()
-    head |= {key: str(campaign.metadata[key]) for key in ("serial", "date") if key in campaign.metadata}
-    if campaign.outputs in ((), ("output",)):
-        return _rows(head, campaign, model, diagnosing)
-    axes = [name.removeprefix("output_") for name in campaign.outputs]
-    return [row for axis in axes for row in _axis_rows(head | {"axis": axis}, campaign, model, diagnosing)]
-
-
-def _axis_rows(head: Row, campaign: Campaign, model: GyroModel, diagnosing: bool) -> list[Row]:
     try:
-        alone = campaign.axis(head["axis"])
-    except CampaignError as error:
-        return [failed(head, error)]
-    return _rows(head, alone, model, diagnosing)
-
-
-def _rows(head: Row, campaign: Campaign, model: GyroModel, diagnosing: bool) -> list[Row]:
-    try:
-        if not diagnosing:
-            estimate = fit(campaign, model)
-            return _parameters(head | {"status": "fitted"}, estimate)
-        diagnosis = diagnose(campaign, model)
+        if lot.diagnosing:
+            diagnosis = diagnose(campaign, lot.model)
+            estimate = diagnosis.extended
+            head = head | {
+                "status": "diagnosed",
+                "verdict": diagnosis.verdict,
+                "causes": ", ".join(cause.effect for cause in diagnosis.causes),
+                "gain_ratio": _known(diagnosis.gain.ratio),
+            }
+        else:
+            estimate = fit(campaign, lot.model)
+            head = head | {"status": "fitted"}
+        return _parameters(
+            head, estimate.record, estimate.model, estimate.covariance, estimate.iterations, estimate.noise_interval
+        )
     except Exception as error:  # one campaign must not end the run
-        return [failed(head, error)]
-    head = head | {
-        "status": "diagnosed",
-        "verdict": diagnosis.verdict,
-        "causes": ", ".join(cause.effect for cause in diagnosis.causes),
-        "gain_ratio": _known(diagnosis.gain.ratio),
-    }
-    return _parameters(head, diagnosis.extended)
+        return [failed(one.head, error)]
 
 
-def _parameters(head: Row, estimate: Estimate) -> list[Row]:
-    head = head | {"samples": int(estimate.record.present.sum()), "iterations": estimate.iterations}
+def _parameters(
+    head: Row, record: Record, model: GyroModel, covariance: np.ndarray, iterations: int, noise: Any = None
+) -> list[Row]:
+    head = head | {"samples": int(record.present.sum()), "iterations": iterations}
     rows = [
         head | {"parameter": f"{r.effect}.{r.name}", "value": float(r.value), "std": float(r.std), "unit": r.unit}
-        for r in estimate.table()
+        for r in calibration_of(model, covariance, record, 0).table()
     ]
-    for name, noise in estimate.noise_table().items():
-        ends = {"low": _known(noise["lo"]), "high": _known(noise["hi"])}
-        rows.append(head | {"parameter": name, "value": float(noise["value"]), "unit": str(noise["unit"])} | ends)
+    for name, found in noise_table(model, noise or {}).items():
+        ends = {"low": _known(found["lo"]), "high": _known(found["hi"])}
+        rows.append(head | {"parameter": name, "value": float(found["value"]), "unit": str(found["unit"])} | ends)
     return rows
 
 

@@ -1,7 +1,7 @@
 """Joint generalised least squares with the noise estimated alongside; estimates carry their covariance."""
 
 from gyromodel.estimate._calibration import Calibration, validity_unit
-from gyromodel.estimate._estimate import Estimate, EstimateError
+from gyromodel.estimate._estimate import Estimate, EstimateError, calibration_of, noise_table
 from gyromodel.estimate._fit import (
     check_covariates,
     filter_of,
@@ -9,6 +9,7 @@ from gyromodel.estimate._fit import (
     fit_record,
     given_ratios,
     make_filter,
+    read_for_fit,
     whiten_columns,
 )
 from gyromodel.estimate._function import FunctionFit, fit_function
@@ -22,6 +23,7 @@ __all__ = [
     "EstimateError",
     "FunctionFit",
     "ManyFits",
+    "calibration_of",
     "check_covariates",
     "filter_of",
     "fit",
@@ -30,6 +32,8 @@ __all__ = [
     "fit_record",
     "given_ratios",
     "make_filter",
+    "noise_table",
+    "read_for_fit",
     "two_stage",
     "validity_unit",
     "whiten_columns",

@@ -82,19 +82,7 @@ class Estimate:
 
         `write_model` keeps it in the model file, and `read_calibration` reads it.
         """
-        record, effects, validity = self.record, [], {}
-        for effect in self.model.effects:
-            if hasattr(effect, "unit"):
-                unit = parameter_unit(effect, next(iter(effect.declared())), record.output_unit, record.units)
-                effect = replace(effect, unit=unit)  # pyright: ignore[reportCallIssue]
-            effects.append(effect)
-        needed = (n for effect in self.model.effects for n in effect.columns_needed)
-        for name in dict.fromkeys(["rate", "temperature", *thermometers(needed)]):
-            values = np.ravel(record.signals.get(name, np.nan))[: record.rows]
-            if np.isfinite(values).any():
-                validity[name] = (float(np.nanmin(values)), float(np.nanmax(values)))
-        model = replace(self.model, effects=tuple(effects))
-        return Calibration(model, self.covariance, validity, self.degrees_of_freedom, record.data_hash)
+        return calibration_of(self.model, self.covariance, self.record, self.degrees_of_freedom)
 
     def table(self) -> tuple[ParameterRow, ...]:
         """Every parameter in its reporting unit; those held fixed have standard uncertainty zero."""
@@ -102,14 +90,7 @@ class Estimate:
 
     def noise_table(self) -> dict[str, dict[str, float | str]]:
         """Noise coefficients with their 95 % intervals, in reporting units."""
-        rows: dict[str, dict[str, float | str]] = {}
-        for name, coefficient in self.model.noise.items():
-            value = float(coefficient)
-            unit = noise_units(self.model.noise_of)[name]
-            scale = factor(internal_unit(unit), unit)
-            low, high = self.noise_interval.get(name, (value, value))
-            rows[name] = {"value": value * scale, "lo": low * scale, "hi": high * scale, "unit": unit}
-        return rows
+        return noise_table(self.model, self.noise_interval)
 
     def propagate(self, function: Callable[[GyroModel], Any]) -> Uncertain:
         """A differentiable function of the model (to any tree of arrays) with its uncertainty, to first order."""
@@ -125,6 +106,35 @@ class Estimate:
             "samples": int(self.record.present.sum()),
             "missing": int(self.record.rows - self.record.present.sum()),
         }
+
+
+def calibration_of(model: GyroModel, covariance: np.ndarray, record: Record, degrees_of_freedom: int) -> Calibration:
+    """A model fitted to a record: with its units, and the ranges that it has seen."""
+    effects, validity = [], {}
+    for effect in model.effects:
+        if hasattr(effect, "unit"):
+            unit = parameter_unit(effect, next(iter(effect.declared())), record.output_unit, record.units)
+            effect = replace(effect, unit=unit)  # pyright: ignore[reportCallIssue]
+        effects.append(effect)
+    needed = (n for effect in model.effects for n in effect.columns_needed)
+    for name in dict.fromkeys(["rate", "temperature", *thermometers(needed)]):
+        values = np.ravel(record.signals.get(name, np.nan))[: record.rows]
+        if np.isfinite(values).any():
+            validity[name] = (float(np.nanmin(values)), float(np.nanmax(values)))
+    model = replace(model, effects=tuple(effects))
+    return Calibration(model, covariance, validity, degrees_of_freedom, record.data_hash)
+
+
+def noise_table(model: GyroModel, intervals: Mapping[str, tuple[float, float]]) -> dict[str, dict[str, float | str]]:
+    """A model's noise coefficients with their intervals, in reporting units; a stated one is its own interval."""
+    rows: dict[str, dict[str, float | str]] = {}
+    for name, coefficient in model.noise.items():
+        value = float(coefficient)
+        unit = noise_units(model.noise_of)[name]
+        scale = factor(internal_unit(unit), unit)
+        low, high = intervals.get(name, (value, value))
+        rows[name] = {"value": value * scale, "lo": low * scale, "hi": high * scale, "unit": unit}
+    return rows
 
 
 def noise_coefficients(ratios: NoiseRatios, white_variance: Any, record: Record, gain: float) -> dict[str, Any]:

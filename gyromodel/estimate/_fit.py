@@ -57,10 +57,7 @@ def fit(
         EstimateError: the campaign does not determine some combination of parameters, or the fit did not converge.
         ModelError: the model needs columns the campaign lacks.
     """
-    campaigns = [campaigns] if isinstance(campaigns, Campaign) else campaigns
-    rated = [with_reference_rates(c)[0] for c in campaigns]
-    means = [MEAN_OF_ATTITUDE * (r is not c) for r, c in zip(rated, campaigns, strict=True)]
-    record = read_signals([average(at_rest(r), len(r), s)[0] for r, s in zip(rated, means, strict=True)])
+    record = read_for_fit([campaigns] if isinstance(campaigns, Campaign) else campaigns)
     if progress:
         progress("fitting", 0.1)
     estimate = with_noise_intervals(fit_record(record, model, solver=solver))
@@ -68,6 +65,17 @@ def fit(
     if progress:
         progress("fitted", 1.0)
     return estimate
+
+
+def read_for_fit(campaigns: Sequence[Campaign]) -> Record:
+    """The signals that `fit` fits to.
+
+    Raises:
+        CampaignError: the campaigns do not match, or one has no output of a gyro.
+    """
+    rated = [with_reference_rates(c)[0] for c in campaigns]
+    means = [MEAN_OF_ATTITUDE * (r is not c) for r, c in zip(rated, campaigns, strict=True)]
+    return read_signals([average(at_rest(r), len(r), s)[0] for r, s in zip(rated, means, strict=True)])
 
 
 def fit_record(

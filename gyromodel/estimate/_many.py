@@ -47,6 +47,7 @@ class ManyFits:
             residual's successive differences, which a wrong minimum leaves small.
         iterations: points that the last search of a campaign looked at.
         converged: whether there is an estimate.
+        bad: whether chi-squared is beyond chance, or no minimum was found, from the given start.
         restarted: whether other starts of the nonlinear parameters were tried.
         reasons: why a fit failed, one sentence; empty where it did not.
     """
@@ -58,6 +59,7 @@ class ManyFits:
     reduced_chi_squared: Float[np.ndarray, " campaign"]
     iterations: Int[np.ndarray, " campaign"]
     converged: Bool[np.ndarray, " campaign"]
+    bad: Bool[np.ndarray, " campaign"]
     restarted: Bool[np.ndarray, " campaign"]
     reasons: Sequence[str]
 
@@ -80,6 +82,7 @@ class _Fitted(NamedTuple):
     restarted: bool
     reason: str
     lost: bool = False  # no minimum was found, or one that cannot be
+    bad: bool = False
 
 
 def fit_many(
@@ -160,8 +163,9 @@ def _fit_together(campaigns: list[Waiting], blocks: int, restarts: bool) -> dict
     first = searches(data, [(i, c.start) for i, c in enumerate(campaigns)], MOST_ITERATIONS)
     fitted = [_finish(c, slots, *found) for c, found in zip(campaigns, first, strict=True)]
     limit = 1.0 + BAD_FIT * np.sqrt(2.0 / data.freedom)
-    bad = [i for i, fit in enumerate(fitted) if restarts and (fit.lost or fit.chi > limit[i])]
-    tried = [(i, x) for i in bad for x in _starts(campaigns[i].model, campaigns[i].record.signals)]
+    fitted = [f._replace(bad=f.lost or f.chi > most) for f, most in zip(fitted, limit, strict=False)]
+    bad = [i for i, fit in enumerate(fitted) if fit.bad]
+    tried = [(i, x) for i in bad if restarts for x in _starts(campaigns[i].model, campaigns[i].record.signals)]
     looked = [found.cost - found.promise for found, _ in searches(data, tried, 1)]
     followed = []
     for i in {i for i, _ in tried}:
@@ -170,7 +174,7 @@ def _fit_together(campaigns: list[Waiting], blocks: int, restarts: bool) -> dict
     for (i, _), found in zip(followed, searches(data, followed, MOST_ITERATIONS), strict=True):
         other = _finish(campaigns[i], slots, *found)
         better = not other.reason and (fitted[i].reason or other.white < fitted[i].white)
-        fitted[i] = (other if better else fitted[i])._replace(restarted=True)
+        fitted[i] = (other if better else fitted[i])._replace(restarted=True, bad=True)
     return {c.place: fit for c, fit in zip(campaigns, fitted, strict=True)}
 
 
@@ -289,6 +293,7 @@ def _gathered(prepared: list[GyroModel], fits: list[_Fitted]) -> ManyFits:
         reduced_chi_squared=np.array([fit.chi for fit in fits]),
         iterations=np.array([fit.iterations for fit in fits], int),
         converged=good,
+        bad=np.array([fit.bad for fit in fits], bool),
         restarted=np.array([fit.restarted for fit in fits], bool),
         reasons=[fit.reason for fit in fits],
     )

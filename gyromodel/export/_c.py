@@ -160,7 +160,7 @@ def _members(model: GyroModel) -> dict[str, str]:
 
 def _output_unit(model: GyroModel) -> str:
     """Internal unit of the output, from the units of the gains."""
-    return internal_unit(" ".join(f"({e.unit})" for e in model.effects if e.site == "gain") + " deg/s")  # type: ignore[attr-defined]
+    return internal_unit(" ".join(f"({e.unit or 1})" for e in model.effects if e.site == "gain") + " deg/s")  # type: ignore[attr-defined]
 
 
 def _identifier(name: str, unit: str) -> str:
