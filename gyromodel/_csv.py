@@ -36,22 +36,29 @@ def read_csv(stream: io.BufferedIOBase) -> Contents:
     Raises:
         CampaignError: the text is no campaign; the message names the line, or the data row and column.
     """
-    metadata, units = _read_csv_head(stream)
-    names = list(units)
-    time = names.index("time")
-    blocks: list[list[np.ndarray]] = []
-    row, previous = 1, None
-    for block in _line_blocks(stream):
-        values = _parse_block(block, names, row)
-        if not len(values[time]):
-            continue
-        check_time(values[time], row, previous)
-        row, previous = row + len(values[time]), float(values[time][-1])
-        blocks.append(values)
+    metadata, units, parts = read_csv_parts(stream)
+    blocks = list(parts)
     if not blocks:
         raise CampaignError("there is a header and no row of data")
-    columns = {name: np.concatenate([block[i] for block in blocks]) for i, name in enumerate(names)}
+    columns = {name: np.concatenate([block[i] for block in blocks]) for i, name in enumerate(units)}
     return columns, units, metadata
+
+
+def read_csv_parts(stream: io.BufferedIOBase) -> tuple[dict[str, Any], dict[str, str], Iterator[list[np.ndarray]]]:
+    """Metadata and units of a CSV text, and its columns some MiB after others, in order."""
+    metadata, units = _read_csv_head(stream)
+
+    def parts() -> Iterator[list[np.ndarray]]:
+        names, row, previous = list(units), 1, None
+        time = names.index("time")
+        for block in _line_blocks(stream):
+            values = _parse_block(block, names, row)
+            if len(values[time]):
+                check_time(values[time], row, previous)
+                row, previous = row + len(values[time]), float(values[time][-1])
+                yield values
+
+    return metadata, units, parts()
 
 
 def _read_csv_head(stream: io.BufferedIOBase) -> tuple[dict[str, Any], dict[str, str]]:
@@ -148,11 +155,21 @@ def _parse_lines(block: bytes, names: list[str], first_row: int) -> list[np.ndar
 
 def write_csv(campaign: Campaign, stream: io.BufferedIOBase) -> None:
     """Write a campaign as CSV text."""
+    stream.write(csv_head(campaign))
+    write_csv_rows(campaign, stream)
+
+
+def csv_head(campaign: Campaign) -> bytes:
+    """Metadata lines and the header."""
+    head = [f"# {key}: {to_text(value)}" for key, value in campaign.metadata.items()]
+    return "\n".join([*head, ",".join(write_headers(campaign)), ""]).encode()
+
+
+def write_csv_rows(campaign: Campaign, stream: Any) -> None:
+    """The rows as text."""
     import pyarrow as pa
     from pyarrow import csv as arrow_csv
 
-    head = [f"# {key}: {to_text(value)}" for key, value in campaign.metadata.items()]
-    stream.write("\n".join([*head, ",".join(write_headers(campaign)), ""]).encode())
     table = pa.table([pa.array(values) for values in campaign.columns.values()], names=write_headers(campaign))
     # Arrow writes the shortest digits that read back as the same number.
     arrow_csv.write_csv(table, stream, arrow_csv.WriteOptions(include_header=False))

@@ -130,6 +130,10 @@ class Campaign:
             raise CampaignError(f"there is no axis '{axis}': the outputs are {listed(self.outputs)}")
         if reason := self.dead(f"output_{axis}"):
             raise CampaignError(reason)
+        return self.renamed_axis(axis)
+
+    def renamed_axis(self, axis: str) -> Campaign:
+        """As `axis`, of a part of a campaign that need not vary."""
         renamed = {f"output_{axis}": "output", f"rate_{axis}": "rate"}
         if f"rate_{axis}" in self.columns and "rate" in self.columns:
             raise CampaignError(f"both 'rate' and 'rate_{axis}' are given: keep the one that is about axis {axis}")
@@ -204,6 +208,13 @@ class Campaign:
         object.__setattr__(self, "columns", MappingProxyType(settled))
         object.__setattr__(self, "units", MappingProxyType(tidy))
         object.__setattr__(self, "metadata", MappingProxyType(metadata))
+
+
+def part_of_campaign(
+    columns: Mapping[str, Any], units: Mapping[str, str], metadata: Mapping[str, Any], name: str
+) -> Campaign:
+    """Some rows of a campaign, which may be few or constant: only the form is checked."""
+    return _restore(columns, units, metadata, name)
 
 
 def _restore(columns: Mapping[str, Any], units: Mapping[str, str], metadata: Mapping[str, Any], name: str) -> Campaign:

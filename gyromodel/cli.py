@@ -299,29 +299,17 @@ def compensate(
     On a campaign with a reference rate, a calibration that makes its error larger is refused.
     """
     refuse_overwriting(output, [model, campaign])
-    from gyromodel._checks import CampaignError
-    from gyromodel.compensation import compensate as compensate_campaign
-    from gyromodel.compensation import reference_error
-    from gyromodel.files import write_campaign
+    from gyromodel._compensate_files import compensate_to
     from gyromodel.model_files import read_calibration
 
-    calibration = read_calibration(model)
-    compensated = compensate_campaign(read_campaigns([campaign], axis)[0], calibration)
-    error, held = reference_error(compensated), ""
-    if error:
-        held = f"rms error against its reference rate is {error.compensated:.4g} deg/s, and {error.as_measured:.4g} as"
-        if error.worse and not force:
-            raise CampaignError(f"{campaign}: {model} makes it worse: the {held} measured; --force writes it anyway")
-    output.parent.mkdir(parents=True, exist_ok=True)
-    write_campaign(compensated, output)
-    note = str(compensated.metadata.get("rate_estimated_note", ""))
-    if note:
-        print(f"gyromodel: {note}", file=sys.stderr)
-    result = {"campaign": str(output), "rows": len(compensated), "note": note, "data_hash": compensated.digest()}
+    done, held = compensate_to(campaign, output, model, read_calibration(model), axis, force)
+    if done.note:
+        print(f"gyromodel: {done.note}", file=sys.stderr)
     if as_json:
-        print(json_text(result | {"reference_error": error and error._asdict()}), end="")
+        result = {"campaign": str(output), "rows": done.rows, "note": done.note, "data_hash": done.data_hash}
+        print(json_text(result | {"reference_error": done.error and done.error._asdict()}), end="")
         return
-    print(f"{len(compensated)} samples in {output}" + (f"; the {held} measured" if held else ""))
+    print(f"{done.rows} samples in {output}" + (f"; the {held} measured" if held else ""))
 
 
 @app.command()

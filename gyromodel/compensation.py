@@ -5,6 +5,7 @@ The model predicts the output from the rate; here the equation is solved for the
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from scipy import stats
 
 from gyromodel._checks import thermometers
@@ -65,7 +66,22 @@ def compensate(campaign: Campaign, calibration: Calibration) -> Campaign:
     needed = {name for effect in calibration.model.effects for name in effect.columns_needed}
     turned = needed & {"rate_x", "rate_y", "rate_z"} - set(campaign.columns)
     rated = with_reference_rates(campaign)[0] if turned else campaign
-    record = read_signals(rated)
+    known = np.isin(campaign.columns["time"], rated.columns["time"])
+    compensated, counts = apply_calibration(campaign, read_signals(rated), calibration, known)
+    return compensated.with_metadata(told(calibration, campaign, counts))
+
+
+def apply_calibration(
+    campaign: Campaign, record: Record, calibration: Calibration, known: np.ndarray | None = None
+) -> tuple[Campaign, Counter[str]]:
+    """The campaign with its rates estimated, and how many samples `told` has to tell of.
+
+    Args:
+        campaign: what gets the columns.
+        record: its signals.
+        calibration: as of `compensate`.
+        known: which of its rows the record has; all of them without.
+    """
     record = record._replace(signals=record.signals | {"rate": jnp.zeros_like(record.signals["time"])})
     check_domain(calibration.model, record.domain)
     # What the calibration leaves open, such as which thermometers, is the campaign's; what it states stays.
@@ -76,16 +92,12 @@ def compensate(campaign: Campaign, calibration: Calibration) -> Campaign:
     check_covariates(record, model)
     check_units(model, record.output_unit, record.units)
     rate, variance = _estimate(calibration, record)
-    notes = _notes(campaign, calibration, record, rate, np.sqrt(variance))
-    known = np.isin(campaign.columns["time"], rated.columns["time"])
+    counts = _counts(calibration, record, rate, np.sqrt(variance))
     for name, values in (("rate_estimated", rate), ("rate_estimated_std", np.sqrt(variance))):
         column = np.full(len(campaign), np.nan)
-        column[known] = from_internal(values, "deg/s")
+        column[slice(None) if known is None else known] = from_internal(values, "deg/s")
         campaign = campaign.with_column(name, column, "deg/s")
-    return campaign.with_metadata({
-        "rate_estimated_std_holds": ", ".join(_held(calibration)) or "nothing",
-        "rate_estimated_note": " ".join(notes) or None,
-    })  # fmt: skip
+    return campaign, counts
 
 
 class ErrorAgainstReference(NamedTuple):
@@ -107,16 +119,27 @@ def reference_error(compensated: Campaign) -> ErrorAgainstReference | None:
     """
     rated, _ = with_reference_rates(compensated)
     compensated, _ = average(rated, len(rated), MEAN_OF_ATTITUDE * (rated is not compensated))
+    errors = reference_errors(compensated)
+    if errors is None or errors.shape[1] < 2 * PARTS:
+        return None
+    parts = np.array_split(errors, PARTS, axis=1)
+    return judged(np.array([np.sum(part**2, axis=1) for part in parts]), np.array([part.shape[1] for part in parts]))
+
+
+def reference_errors(compensated: Campaign) -> Float[np.ndarray, "estimate sample"] | None:
+    """Errors (deg/s) of the estimated rate and of the output as it is, where both are known; None without a rate."""
     output, unit = rate_output(compensated)
     if "rate" not in compensated.columns or unit != "rad/s":
         return None
     rate = compensated.in_unit("rate", "deg/s")
     errors = np.array([compensated.in_unit("rate_estimated", "deg/s") - rate, from_internal(output, "deg/s") - rate])
-    errors = errors[:, np.isfinite(errors).all(axis=0)]
-    if errors.shape[1] < 2 * PARTS:
-        return None
-    after, before = np.sqrt(np.mean(errors**2, axis=1))
-    excess = [float(np.mean(part[0] ** 2 - part[1] ** 2)) for part in np.array_split(errors, PARTS, axis=1)]
+    return errors[:, np.isfinite(errors).all(axis=0)]
+
+
+def judged(sums: Float[np.ndarray, "part estimate"], counts: Int[np.ndarray, " part"]) -> ErrorAgainstReference:
+    """The verdict on sums of squares of `reference_errors`, and how many there are in each part."""
+    after, before = np.sqrt(sums.sum(axis=0) / counts.sum())
+    excess = (sums[:, 0] - sums[:, 1]) / counts
     worse = np.mean(excess) > float(stats.t.ppf(0.95, PARTS - 1)) * np.std(excess, ddof=1) / np.sqrt(PARTS)
     return ErrorAgainstReference(float(after), float(before), bool(worse))
 
@@ -142,14 +165,29 @@ def _estimate(calibration: Calibration, record: Record) -> tuple[np.ndarray, np.
     return rate, variance if _held(calibration) else np.full_like(variance, np.nan)
 
 
-def _notes(
-    campaign: Campaign, calibration: Calibration, record: Record, rate: np.ndarray, std: np.ndarray
-) -> list[str]:
-    """What a user of the estimated rate must know, a sentence each."""
-    model, present, notes = calibration.model, record.present, []
-    if lost := int((present & np.isnan(rate)).sum()):
+def _counts(calibration: Calibration, record: Record, rate: np.ndarray, std: np.ndarray) -> Counter[str]:
+    """Samples that `told` tells of: what has no rate, lies outside of a calibrated range, or is of another run."""
+    present = record.present
+    counts = Counter(present=int(present.sum()), lost=int((present & np.isnan(rate)).sum()))
+    for name, (low, high) in calibration.validity.items():
+        if name != "rate" and name not in record.signals:
+            continue
+        values = rate if name == "rate" else np.asarray(record.signals[name])[: record.rows]
+        margin = SURELY * np.nan_to_num(std) if name == "rate" else ROUNDING * max(abs(low), abs(high))
+        counts[name] += int((present & ((values < low - margin) | (values > high + margin))).sum())
+    for i, effect in enumerate(calibration.model.effects):
+        if isinstance(effect, BiasTurnOn):
+            run = np.asarray(record.signals["run"])[: record.rows]
+            counts[f"run {i}"] += int((present & ~np.isin(run, np.asarray(effect.runs))).sum())
+    return counts
+
+
+def told(calibration: Calibration, campaign: Campaign, counts: Counter[str]) -> dict[str, str | None]:
+    """Metadata of a compensated campaign: what its uncertainty holds, and what a user must know, a sentence each."""
+    model, notes, present = calibration.model, [], counts["present"]
+    if lost := counts["lost"]:
         notes.append(
-            f"{lost} of {present.sum()} samples have no estimated rate: on its branch through rest the model gives "
+            f"{lost} of {present} samples have no estimated rate: on its branch through rest the model gives "
             "their output at no rate."
         )
     for name, (low, high) in calibration.validity.items():
@@ -157,16 +195,13 @@ def _notes(
         limits = f"{from_internal(low, unit):.6g} to {from_internal(high, unit):.6g} {unit}"
         if name != "rate" and name not in campaign.columns:
             notes.append(f"There is no column {name} to hold against the calibrated range of {limits}.")
-            continue
-        values = rate if name == "rate" else np.asarray(record.signals[name])[: record.rows]
-        margin = SURELY * np.nan_to_num(std) if name == "rate" else ROUNDING * max(abs(low), abs(high))
-        if outside := int((present & ((values < low - margin) | (values > high + margin))).sum()):
-            notes.append(f"{outside} of {present.sum()} samples lie outside the calibrated range of {name}, {limits}.")
-    for runs in [np.asarray(e.runs) for e in model.effects if isinstance(e, BiasTurnOn)]:
-        if other := int((present & ~np.isin(np.asarray(record.signals["run"])[: record.rows], runs)).sum()):
-            known = ", ".join(f"{r:g}" for r in runs)
+        elif outside := counts[name]:
+            notes.append(f"{outside} of {present} samples lie outside the calibrated range of {name}, {limits}.")
+    for i, effect in enumerate(model.effects):
+        if other := counts[f"run {i}"]:
+            known = ", ".join(f"{r:g}" for r in np.asarray(effect.runs))  # type: ignore[attr-defined]
             notes.append(
-                f"{other} of {present.sum()} samples are of other runs than {known} and take the first run's bias: "
+                f"{other} of {present} samples are of other runs than {known} and take the first run's bias: "
                 "what turn-ons differ by is not in rate_estimated_std."
             )
     if timed := [e.label for e in model.effects if "time" in e.columns_needed]:
@@ -175,7 +210,10 @@ def _notes(
         notes.append("The model was not fitted: rate_estimated_std leaves out the uncertainty of its parameters.")
     if not model.noise:
         notes.append("The model states no noise: rate_estimated_std leaves it out.")
-    return notes
+    return {
+        "rate_estimated_std_holds": ", ".join(_held(calibration)) or "nothing",
+        "rate_estimated_note": " ".join(notes) or None,
+    }
 
 
 @eqx.filter_jit

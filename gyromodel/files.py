@@ -21,7 +21,16 @@ from typing import Any
 import numpy as np
 
 from gyromodel._checks import CampaignError, check_unit, shown
-from gyromodel._csv import Contents, from_text, read_csv, read_headers, to_text, write_csv, write_headers
+from gyromodel._csv import (
+    Contents,
+    from_text,
+    read_csv,
+    read_csv_parts,
+    read_headers,
+    to_text,
+    write_csv,
+    write_headers,
+)
 from gyromodel.campaign import Campaign
 
 # Orders the variables of a NetCDF or Zarr file, which keep no order of their own.
@@ -72,7 +81,7 @@ def write_campaign(campaign: Campaign, path: str | os.PathLike[str]) -> None:
         suffix = _suffix(path)
         if path.is_dir() and not (suffix == ".zarr" and any((path / name).exists() for name in _ZARR_FILES)):
             raise CampaignError("is a folder that holds something else than a campaign")
-        with _replacing(Path(os.path.realpath(path))) as temporary:
+        with replacing(Path(os.path.realpath(path))) as temporary:
             _WRITERS[suffix](campaign, temporary)
     except CampaignError as error:
         raise CampaignError(f"{path}: {error}") from error
@@ -95,7 +104,7 @@ def _suffix(path: Path) -> str:
 
 
 @contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path) -> Iterator[Path]:
     """A hidden sibling that takes the place of `path` at the end, or goes away after an error."""
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
@@ -160,20 +169,49 @@ def _read_parquet(path: Path) -> Contents:
     from pyarrow import parquet
 
     with _damage("Parquet"), parquet.ParquetFile(path, page_checksum_verification=True) as file:
-        schema = file.schema_arrow
-        units = read_headers(schema.names)
-        for name, kind in zip(units, schema.types, strict=True):
-            if not any(test(kind) for test in (pa.types.is_floating, pa.types.is_integer, pa.types.is_decimal)):
-                raise CampaignError(f"column '{name}' holds {kind}, expected numbers")
+        units, metadata = _parquet_head(file.schema_arrow)
         table = file.read()
         columns = {
             name: column.cast(pa.float64(), safe=False).to_numpy()
             for name, column in zip(units, table.columns, strict=True)
         }
-        texts = {key.decode(): value.decode() for key, value in (schema.metadata or {}).items()}
-    # What pandas and Arrow note for themselves is not about the gyro.
-    metadata = {key: from_text(text) for key, text in texts.items() if key not in ("pandas", "ARROW:schema")}
     return columns, units, metadata
+
+
+def _parquet_head(schema: Any) -> tuple[dict[str, str], dict[str, Any]]:
+    """Units and metadata of a Parquet file."""
+    import pyarrow as pa
+
+    units = read_headers(schema.names)
+    for name, kind in zip(units, schema.types, strict=True):
+        if not any(test(kind) for test in (pa.types.is_floating, pa.types.is_integer, pa.types.is_decimal)):
+            raise CampaignError(f"column '{name}' holds {kind}, expected numbers")
+    texts = {key.decode(): value.decode() for key, value in (schema.metadata or {}).items()}
+    # What pandas and Arrow note for themselves is not about the gyro.
+    return units, {key: from_text(text) for key, text in texts.items() if key not in ("pandas", "ARROW:schema")}
+
+
+@contextmanager
+def reading_parts(path: Path) -> Iterator[tuple[dict[str, str], dict[str, Any], Iterator[list[np.ndarray]]] | None]:
+    """Units, metadata, and the columns of some rows after others, of a kind of file that can be read so; else None."""
+    suffix = _suffix(path)
+    if suffix == ".parquet":
+        import pyarrow as pa
+        from pyarrow import parquet
+
+        # What is fetched ahead would be kept to the end.
+        with parquet.ParquetFile(path, page_checksum_verification=True, pre_buffer=False) as file:
+            parts = (
+                [column.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False) for column in batch.columns]
+                for batch in file.iter_batches(1 << 16)
+            )
+            yield *_parquet_head(file.schema_arrow), parts
+    elif suffix in (".csv", ".csv.gz"):
+        with open(path, "rb") if suffix == ".csv" else gzip.open(path, "rb") as stream:
+            metadata, units, parts = read_csv_parts(stream)
+            yield units, metadata, parts
+    else:
+        yield None
 
 
 def _write_parquet(campaign: Campaign, path: Path) -> None:
