@@ -11,6 +11,7 @@ import pytest
 import gyromodel as gm
 from gyromodel.averages import average
 from gyromodel.diagnosis._isolation import settling_test
+from gyromodel.effects.drivers import BiasColumn
 from gyromodel.model import ModelError
 from gyromodel.model_files import read_model, write_model
 from gyromodel.signals import rate_output, read_signals
@@ -180,6 +181,18 @@ def test_nothing_is_left_out_silently(seed: int, rng: np.random.Generator) -> No
     for column in "abcd":
         for name in (f"bias_{column}", f"smooth({column})"):
             assert name in found.searched or name in found.not_testable
+
+
+def test_a_size_that_changes_with_temperature_is_not_passed_over(rng: np.random.Generator) -> None:
+    """A product of temperature with the fourth of the columns, of 45 standard deviations: of other pairs alone, none."""
+    temperature = 20 + 15 * np.sin(TIME / 380)
+    sway = dict(zip("abcd", rng.choice([-1.0, 0.0, 1.0], size=(4, ROWS)), strict=True))
+    output = 2 * sway["d"] + 0.3 * (temperature - 20) * sway["d"] + rng.normal(size=ROWS)
+    model = gm.model_from_effects(["bias", "bias_temperature"]).with_effect(BiasColumn(column="d"))
+    found = gm.diagnose(campaign(output, temperature=temperature, **sway), model, hold_out=False)
+    assert found.verdict == "unknown"
+    assert found.driver is not None
+    assert found.driver.column == "temperature and d"
 
 
 def late_thermometer(

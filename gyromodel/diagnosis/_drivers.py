@@ -6,11 +6,11 @@ some time before.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 
 import numpy as np
 
-from gyromodel._checks import DERIVED
+from gyromodel._checks import DERIVED, thermometers
 from gyromodel.declarations import EARLIER, RATE_OF, measured
 from gyromodel.signals import Record, thermometer_rate
 from gyromodel.units import is_angle
@@ -63,6 +63,21 @@ def smooths(record: Record) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
             for scale in PAIR_SCALES:
                 of_x, of_y = _bumps(record, x, scale), _bumps(record, y, scale)
                 yield f"smooth({a}, {b})", x, (of_x[:, :, None] * of_y[:, None, :]).reshape(len(x), -1)
+
+
+def products(record: Record, known: Container[str]) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Name, values of the first column, and product of each pair of rate or temperature with another, less those known.
+
+    All pairs as smooth functions would be too many. A product is what an effect becomes whose size follows rate or
+    temperature, such as a mass unbalance that changes with temperature.
+    """
+    names = driver_names(record) if record.domain == "gyro" else ()
+    for a in (n for n in ("rate", "temperature") if n in names):
+        alike = {a, "rate", "thermistor_resistance", *thermometers(names)} if a == "temperature" else {a, "rate_spin"}
+        for b in (n for n in names if n not in {*alike, "campaign"} and f"smooth({a}, {n})" not in known):
+            x, y = (np.asarray(record.signals[n]) for n in (a, b))
+            centred = (v - v[: record.rows].mean() for v in (x, y))
+            yield f"smooth({a}, {b})", x, np.prod(list(centred), axis=0)[:, None]
 
 
 def smooth_columns(name: str) -> tuple[str, ...]:

@@ -108,6 +108,7 @@ class Scanner:
         self._widths = np.array([b.width for b in bank.blocks], int)
         self._positive = np.array([b.effect is not None and b.effect.positive for b in bank.blocks])
         self._least = np.array([b.least for b in bank.blocks])
+        self._price = np.array([b.price for b in bank.blocks])
         self.epochs = np.flatnonzero(self.present[: record.rows])[1:-1]
 
     def without(self, rows: np.ndarray, cells: list[int]) -> Scanner:
@@ -273,7 +274,8 @@ class Scanner:
         # A form that loses more columns than the baseline contains is another form in disguise.
         sound = q_of >= least
         energy[~sound] = 0.0
-        ratio = np.where(sound[:, None], log_evidence_ratio(t_of, batch.rss, nu, q_of[:, None]), -np.inf)[self._order]
+        ratio = log_evidence_ratio(t_of, batch.rss, nu, q_of[:, None]) - self._price[:, None]
+        ratio = np.where(sound[:, None], ratio, -np.inf)[self._order]
         # Structures compete by their mean over shapes; the best shape of the best structure stands for the name.
         means, shapes = log_mean_of_parts(ratio, self._structure_starts)
         evidence, best = log_mean_of_parts(means, self._name_starts)
