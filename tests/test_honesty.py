@@ -184,7 +184,7 @@ def test_nothing_is_left_out_silently(seed: int, rng: np.random.Generator) -> No
 
 
 def test_a_size_that_changes_with_temperature_is_not_passed_over(rng: np.random.Generator) -> None:
-    """A product of temperature with the fourth of the columns, of 45 standard deviations: of other pairs alone, none."""
+    """A product of temperature with the fourth of the columns, of 45 standard deviations."""
     temperature = 20 + 15 * np.sin(TIME / 380)
     sway = dict(zip("abcd", rng.choice([-1.0, 0.0, 1.0], size=(4, ROWS)), strict=True))
     output = 2 * sway["d"] + 0.3 * (temperature - 20) * sway["d"] + rng.normal(size=ROWS)
