@@ -150,8 +150,11 @@ def _significant_driver(ranking: Ranking, threshold: float, runs: int) -> str | 
 
 
 def _before(i: int, path: list[Found], estimates: list[Estimate]) -> Selection:
-    """The search as it stood before step i, from which on it followed time without a name."""
+    """The search as it stood before step i, from which on it followed time, or what leads the step, without a name."""
     ranking, driver = path[i].ranking, "smooth(time)"
+    leading, score = ranking.best(drivers=True)
+    if score > ranking.statistic[path[i].name]:
+        driver = leading
     return Selection(
         estimates[i],
         tuple(standing(path[:i])),
