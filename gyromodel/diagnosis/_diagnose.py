@@ -17,6 +17,7 @@ from gyromodel.diagnosis._evidence import SAFE_THRESHOLD
 from gyromodel.diagnosis._gain import ladder_error, nested_gain, no_gain, not_measured
 from gyromodel.diagnosis._isolation import settling_test
 from gyromodel.diagnosis._noise_causes import as_cause, quantisation, telegraph
+from gyromodel.diagnosis._points import dwells_apart
 from gyromodel.diagnosis._ranking import Ranking, cells_of_weight, is_driver, is_noise, noise_kinds
 from gyromodel.diagnosis._result import Candidate, Cause, Diagnosis, Gain, ParameterValue, Round
 from gyromodel.diagnosis._scan import Scanner
@@ -168,7 +169,8 @@ def diagnose(
     if hold_out:
         say("judging each step on blocks left out", 0.62)
         selection = session.pruned(selection)
-    findings += [line for line in (tails(selection.estimate), noise_level(selection.estimate)) if line]
+    last = selection.estimate
+    findings += [line for line in (tails(last), noise_level(last), dwells_apart(last, unit)) if line]
     say("judging", 0.65)
     scale = factor(record.input_unit, unit)
     ordinary = tuple(hold_out and session.ladder(e)[2] for e in (baseline, selection.estimate))
