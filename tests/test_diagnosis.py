@@ -24,6 +24,7 @@ from gyromodel.diagnosis._evidence import SIZES, explained_for, log_evidence_rat
 from gyromodel.diagnosis._ranking import rank
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._verdict import _places
+from gyromodel.effects.thermal import BiasWarmup
 from gyromodel.estimate import EstimateError, fit_record
 from gyromodel.model import record_span
 from gyromodel.noise import NoiseGrid, NoiseRatios, markov_sum
@@ -195,6 +196,30 @@ def test_calibration_is_kept_by_design(rng: np.random.Generator, tmp_path, monke
     drawn = len(said)
     assert np.array_equal(null_scores(scanner, baseline, 128, 1, lambda line, done: said.append(line)), scores)
     assert len(said) == drawn
+
+
+def test_a_fold_does_not_search_what_only_the_rows_left_out_would_tell(rng: np.random.Generator) -> None:
+    """A warm-up that was over before the fold begins is a pulse in its first row, of an amplitude beyond bounds."""
+    record = read_signals(static_log(rng))
+    ratios = NoiseRatios(jnp.zeros(1), jnp.zeros(1))
+    grid = NoiseGrid(ratios, np.zeros(1), record.interval, record_span(record))
+    first = record.rows // 5
+    fold = Scanner(record, build_bank(record), grid).without(np.arange(first), [0])
+    residual = rng.standard_normal(len(fold.present))
+    residual[first] += 50.0
+    form = fold.run([0], np.ones((len(residual), 1)), np.where(fold.present, residual, 0.0), {})[0].best["bias_warmup"][
+        0
+    ]
+    assert isinstance(form, int)
+    effect = fold.bank.blocks[form].effect
+    assert isinstance(effect, BiasWarmup)
+    assert float(record.signals["time_on"][first]) < 9.0 * float(effect.time_constant)
+
+
+def test_a_warm_up_that_was_over_is_not_searched() -> None:
+    time = jnp.arange(100.0) * 10.0
+    assert BiasWarmup.candidates({"time_on": time + 1e5}) == []
+    assert min(float(e.time_constant) for e in BiasWarmup.candidates({"time_on": time + 600.0})) >= 50.0 * (1 - 1e-9)
 
 
 def test_ring_laser_table_is_four_points_or_a_curve() -> None:

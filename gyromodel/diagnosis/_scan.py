@@ -28,6 +28,8 @@ from gyromodel.noise import NoiseGrid
 from gyromodel.signals import Record
 
 THREADS = 2
+# A form with less than this part of its energy in the rows kept was told by those left out.
+LOST = 1e-6
 # Lines whose interpolated statistic, were it this much larger, would not pay for the search are left interpolated.
 PEAK_SLACK = 1.5
 NO_LINES = np.zeros(0)
@@ -109,13 +111,20 @@ class Scanner:
         self._positive = np.array([b.effect is not None and b.effect.positive for b in bank.blocks])
         self._least = np.array([b.least for b in bank.blocks])
         self._price = np.array([b.price for b in bank.blocks])
+        self._lost = np.zeros(len(bank.blocks), bool)
         self.epochs = np.flatnonzero(self.present[: record.rows])[1:-1]
 
     def without(self, rows: np.ndarray, cells: list[int]) -> Scanner:
-        """The same search on the record without some rows, in some of the noise cells."""
+        """The same search on the record without some rows, in some of the noise cells.
+
+        An effect's form is left out with the rows that told it: what hardly shows in the others says nothing of them.
+        """
         other = copy(self)
         other.record = self.record.without(rows)
         other.present = np.asarray(other.record.sampling.present)
+        whole, left = (np.sum(self.bank.columns[present] ** 2, axis=0) for present in (self.present, other.present))
+        gone = np.add.reduceat((left < LOST * whole).astype(int), [b.start for b in self.bank.blocks])
+        other._lost = np.array([b.kind == "effect" for b in self.bank.blocks]) & (gone > 0)
         other.epochs = np.flatnonzero(other.present[: other.record.rows])[1:-1]
         other.cells, other.only_cells = self.cells.sampled(other.record.sampling), cells
         return other
@@ -272,7 +281,7 @@ class Scanner:
             q_of[here] = keep.sum(1)
             energy[here] = np.sum(values * keep, axis=1) / np.maximum(q_of[here], 1) * np.mean(norm**2, axis=1)
         # A form that loses more columns than the baseline contains is another form in disguise.
-        sound = q_of >= least
+        sound = (q_of >= least) & ~self._lost
         energy[~sound] = 0.0
         ratio = log_evidence_ratio(t_of, batch.rss, nu, q_of[:, None]) - self._price[:, None]
         ratio = np.where(sound[:, None], ratio, -np.inf)[self._order]
