@@ -62,21 +62,30 @@ class _Session:
                 return Selection(estimates[-1], found, path, step.ranking, estimates, None, remains=step.name)
         return selection
 
-    def resolved(self, selection: Selection, step: float) -> Selection:
-        """The rounds, cut before an effect that is nowhere half a step of the readings large.
+    def resolved(self, selection: Selection, step: float) -> tuple[Selection, str]:
+        """The rounds, cut before an effect that is nowhere larger than what passes for one, and why.
 
         Readings of what moves within a step stand still, and a still reading of a moving thing is an error that
-        follows the motion: it is not the noise that the evidence weighs. No step, as of any gyro, cuts nothing.
+        follows the motion: it is not the noise that the evidence weighs. Nor is what an effect found before may leave.
         """
+        signals, rows = self.record.signals, self.record.rows
         for i, (done, estimate) in enumerate(zip(selection.path, selection.estimates[1:], strict=False)):
-            if step and done.effect is not None and done.effect.label in estimate.model.labels:
-                effect = estimate.model.effects[estimate.model.labels.index(done.effect.label)]
-                size = np.asarray(effect.contribution(self.record.signals))[: self.record.rows]
-                if np.abs(size).max() < 0.5 * step:
-                    path, estimates = selection.path[:i], selection.estimates[: i + 1]
-                    found = tuple(standing(path))
-                    return Selection(estimates[-1], found, path, done.ranking, estimates, None, remains=done.name)
-        return selection
+            if done.effect is None or done.effect.label not in estimate.model.labels:
+                continue
+            effect = estimate.model.effects[estimate.model.labels.index(done.effect.label)]
+            size = float(np.abs(np.asarray(effect.contribution(signals))[:rows]).max())
+            left = {e.label: e.leaves(signals) for e in estimate.model.effects if e.label != effect.label}
+            other = max(left, key=lambda label: left[label], default="")
+            if step and size < 0.5 * step:
+                why = f"half a step of the encoders ({np.rad2deg(step):.2g} deg)", "readings that stand still pass"
+            elif other and size < left[other]:
+                why = f"{np.rad2deg(left[other]):.2g} deg", f"what {other} leaves unsaid passes"
+            else:
+                continue
+            path, estimates = selection.path[:i], selection.estimates[: i + 1]
+            cut = Selection(estimates[-1], tuple(standing(path)), path, done.ranking, estimates, None, remains=done.name)
+            return cut, f"{done.name} would be within {why[0]} throughout, where {why[1]} for it: not named."
+        return selection, ""
 
 
 def diagnose(
@@ -159,12 +168,8 @@ def diagnose(
         first = selection.path[0].ranking if selection.path else selection.last
         start = _with_noise_estimated(baseline) or baseline
         selection = Selection(start, (), (), first, (start,), None)
-    whole, selection = selection, session.resolved(selection, data.step)
-    if whole is not selection:
-        findings.append(
-            f"{selection.remains} would be within half a step of the encoders ({np.rad2deg(data.step):.2g} deg) "
-            "throughout, where readings that stand still pass for it: not named."
-        )
+    selection, unresolved = session.resolved(selection, data.step)
+    findings += [unresolved] if unresolved else []
     if hold_out:
         say("judging each step on blocks left out", 0.62)
         selection = session.pruned(selection)

@@ -11,7 +11,7 @@ from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._evidence import log_sum
 from gyromodel.diagnosis._forms import MAXIMUM_LINES, addition
 from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise, line_frequencies, rank_where_it_matters
-from gyromodel.diagnosis._scan import Scanner
+from gyromodel.diagnosis._scan import CLEARLY, Scanner
 from gyromodel.effects import Effect
 from gyromodel.estimate import Estimate, EstimateError, fit_record
 from gyromodel.model import GyroModel
@@ -213,7 +213,7 @@ def refit(record: Record, baseline: Estimate, found: list[Found], noise: NoisePa
     for attempt in (model, _shapes_held(model, found)):
         try:
             # Another solver would be compiled anew for each model, and has rescued none that this one lost.
-            return fit_record(
+            after = fit_record(
                 data,
                 attempt,
                 ratios=ratios,
@@ -222,7 +222,19 @@ def refit(record: Record, baseline: Estimate, found: list[Found], noise: NoisePa
             )
         except EstimateError:
             continue
+        if not _negative(after, found):
+            return after
     return None
+
+
+def _negative(estimate: Estimate, found: list[Found]) -> bool:
+    """Whether something found is clearly below zero in a coefficient that cannot be."""
+    of = {f.effect.label for f in found if f.effect is not None and f.effect.positive}
+    std = np.sqrt(np.diag(estimate.covariance))
+    return any(
+        slot.linear and estimate.model.labels[slot.effect] in of and value < -CLEARLY * spread
+        for slot, value, spread in zip(estimate.model.slots(), np.asarray(estimate.model.vector()), std, strict=True)
+    )
 
 
 def _shapes_held(model: GyroModel, found: list[Found]) -> GyroModel:
