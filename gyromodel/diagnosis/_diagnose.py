@@ -62,31 +62,6 @@ class _Session:
                 return Selection(estimates[-1], found, path, step.ranking, estimates, None, remains=step.name)
         return selection
 
-    def resolved(self, selection: Selection, step: float) -> tuple[Selection, str]:
-        """The rounds, cut before an effect that is nowhere larger than what passes for one, and why.
-
-        Readings of what moves within a step stand still, and a still reading of a moving thing is an error that
-        follows the motion: it is not the noise that the evidence weighs. Nor is what an effect found before may leave.
-        """
-        signals, rows = self.record.signals, self.record.rows
-        for i, (done, estimate) in enumerate(zip(selection.path, selection.estimates[1:], strict=False)):
-            if done.effect is None or done.effect.label not in estimate.model.labels:
-                continue
-            effect = estimate.model.effects[estimate.model.labels.index(done.effect.label)]
-            size = float(np.abs(np.asarray(effect.contribution(signals))[:rows]).max())
-            left = {e.label: e.leaves(signals) for e in estimate.model.effects if e.label != effect.label}
-            other = max(left, key=lambda label: left[label], default="")
-            if step and size < 0.5 * step:
-                why = f"half a step of the encoders ({np.rad2deg(step):.2g} deg)", "readings that stand still pass"
-            elif other and size < left[other]:
-                why = f"{np.rad2deg(left[other]):.2g} deg", f"what {other} leaves unsaid passes"
-            else:
-                continue
-            path, estimates = selection.path[:i], selection.estimates[: i + 1]
-            cut = Selection(estimates[-1], tuple(standing(path)), path, done.ranking, estimates, None, remains=done.name)
-            return cut, f"{done.name} would be within {why[0]} throughout, where {why[1]} for it: not named."
-        return selection, ""
-
 
 def diagnose(
     campaigns: Campaign | Sequence[Campaign],
@@ -127,7 +102,8 @@ def diagnose(
     say("laying out the search", 0.06)
     bank = build_bank(record)
     grid = _grid(record, baseline)
-    session = _Session(Scanner(record, bank, grid, stated=baseline.noise_given), SAFE_THRESHOLD)
+    scanner = Scanner(record, bank, grid, stated=baseline.noise_given, step=data.step)
+    session = _Session(scanner, SAFE_THRESHOLD)
     nulls = np.zeros(0)
     if calibrate:
         nulls = null_scores(session.scanner, baseline, calibrate, seed, say)
@@ -142,7 +118,8 @@ def diagnose(
         except EstimateError:
             grows = None
         else:
-            again = _Session(Scanner(weighted, bank, grid, stated=alike.noise_given), session.threshold)
+            scanner = Scanner(weighted, bank, grid, stated=alike.noise_given, step=data.step)
+            again = _Session(scanner, session.threshold)
             other = again.run(alike, say)
             if _unfinished(other):
                 # Structure that is left passes for a level that varies; without any left, the level passed for it.
@@ -168,8 +145,7 @@ def diagnose(
         first = selection.path[0].ranking if selection.path else selection.last
         start = _with_noise_estimated(baseline) or baseline
         selection = Selection(start, (), (), first, (start,), None)
-    selection, unresolved = session.resolved(selection, data.step)
-    findings += [unresolved] if unresolved else []
+    findings += [selection.unresolved] if selection.unresolved else []
     if hold_out:
         say("judging each step on blocks left out", 0.62)
         selection = session.pruned(selection)

@@ -85,9 +85,18 @@ class Scanner:
     """Evidence of a bank's candidates on one record (or the record less some rows), over noise cells."""
 
     def __init__(
-        self, record: Record, bank: Bank, grid: NoiseGrid, *, outliers: bool = True, stated: bool = False
+        self,
+        record: Record,
+        bank: Bank,
+        grid: NoiseGrid,
+        *,
+        outliers: bool = True,
+        stated: bool = False,
+        step: float = 0.0,
     ) -> None:
         self.record, self.bank, self.grid = record, bank, grid
+        # Of the readings that the output is computed from; none of a gyro.
+        self.step = step
         self.present = np.asarray(record.sampling.present)
         self.runs = int(np.asarray(record.sampling.restart).sum())
         self.steps = "bias_step" in bank.scans

@@ -56,7 +56,7 @@ class Selection:
     """Where the rounds ended: the extended fit, what was added, and the ranking in which no more was significant.
 
     `left_out` holds rankings beside everything found except one, where the search has made them; `remains` names what
-    was still significant and not added.
+    was still significant and not added, `unresolved` says why if it is too small.
     """
 
     estimate: Estimate
@@ -67,6 +67,7 @@ class Selection:
     driver: str | None
     left_out: dict[int, Ranking] = field(default_factory=dict, repr=False)
     remains: str = ""
+    unresolved: str = ""
 
 
 def search(
@@ -91,7 +92,7 @@ def search(
         avoid: a name that is not to be the first.
     """
     path: list[Found] = []
-    estimates, remains = [baseline], ""
+    estimates, remains, small = [baseline], "", ""
     while True:
         estimate = estimates[-1]
         pulses = tuple(r for f in path for r in f.rows)
@@ -109,7 +110,8 @@ def search(
             return _before(steps[0], path, estimates)
         step = Found(name, *addition(scanner, estimate, ranking, name, pulses), ranking)
         after = refit(record, baseline, standing([*path, step]), noise)
-        if after is None:
+        small = _unresolved(after, step, scanner.step) if after is not None else ""
+        if after is None or small:
             remains = name
             break
         if progress:
@@ -139,7 +141,33 @@ def search(
             name, score = ranking.best(drivers=False, but=("bias_periodic",))
             remains = remains or (str(name) if score >= threshold else "")
     driver = _significant_driver(ranking, threshold, scanner.runs)
-    return Selection(estimates[-1], tuple(found), tuple(path), ranking, tuple(estimates), driver, left_out, remains)
+    return Selection(
+        estimates[-1], tuple(found), tuple(path), ranking, tuple(estimates), driver, left_out, remains, small
+    )
+
+
+def _unresolved(estimate: Estimate, step: Found, reading: float) -> str:
+    """Why an effect says nothing, as it is nowhere larger than what passes for it; `reading`: the step of readings.
+
+    Readings of what moves within a step stand still, and a still reading of a moving thing is an error that follows
+    the motion: it is not the noise that the evidence weighs. Nor is what another effect may leave.
+    """
+    model, record = estimate.model, estimate.record
+    if step.effect is None or step.effect.label not in model.labels:
+        return ""
+    effect = model.effects[model.labels.index(step.effect.label)]
+    size = float(np.abs(np.asarray(effect.contribution(record.signals))[: record.rows]).max())
+    left = {e.label: e.leaves(record.signals) for e in model.effects if e.label != effect.label}
+    other = max(left, key=lambda label: left[label], default="")
+    if reading and size < 0.5 * reading:
+        within = f"half a step of the encoders ({np.rad2deg(reading):.2g} deg)"
+        passes = "readings that stand still pass"
+    elif other and size < left[other]:
+        within = f"{np.rad2deg(left[other]):.2g} deg"
+        passes = f"what sticks, which {other} leaves out, passes"
+    else:
+        return ""
+    return f"{step.name} would be within {within} throughout, where {passes} for it: not named."
 
 
 def _significant_driver(ranking: Ranking, threshold: float, runs: int) -> str | None:
@@ -324,7 +352,7 @@ def _exchange(
             if len(standing(changed)) < len(changed):
                 continue
             after = refit(record, baseline, changed, noise)
-            if after is not None:
+            if after is not None and not _unresolved(after, step, scanner.step):
                 found, estimate, rankings = changed, after, {i: ranking}
         return found, estimate, rankings
 

@@ -226,7 +226,7 @@ class ShaftFriction(_ThroughLoop):
         return self.turned(signals)
 
     def leaves(self, signals: Signals) -> float:
-        """Twice what Coulomb friction turns the base's angle by: so far a shaft that sticks may be from one that slides.
+        """Twice what Coulomb friction turns the base's angle by: so far is a shaft that sticks from one that slides.
 
         A gimbal that hardly turns, as the redundant one, sticks for much of each period.
         """
