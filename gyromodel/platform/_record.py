@@ -25,8 +25,9 @@ from gyromodel.platform._gimbals import GimbalErrors, base_angles
 from gyromodel.platform._motion import GIMBALS, BaseMotion, base_motion
 from gyromodel.signals import Record, laid_out
 
-# Phase (rad) of the fastest oscillation over a mean of samples, that of a record with too many rows, and their number.
-PHASE, WIDEST, MAXIMUM_ROWS = 0.7, 1.5, 5_000
+# Phase (rad) of the fastest oscillation over a mean of samples, that of a record with too many rows, whose fastest
+# oscillations a mean makes smaller by a sixth at most, and their number.
+PHASE, WIDEST, MAXIMUM_ROWS = 0.7, 2.0, 4_000
 # Fewest means of a run, and most groups of runs of which each is left out once.
 FEWEST, GROUPS = 24, 6
 # Variance of a stretch's own constant, over that of white noise.
