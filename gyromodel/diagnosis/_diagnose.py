@@ -55,9 +55,11 @@ class _Session:
     def pruned(self, selection: Selection) -> Selection:
         """The rounds, cut where (after the first step) the error on blocks left out stops falling."""
         for i in range(2, len(selection.estimates)):
-            now, before = self.ladder(selection.estimates[i]), self.ladder(selection.estimates[i - 1])
-            if selection.path[i - 1].effect is not None and now[0] > before[0] and now[1] < before[1]:
-                path, estimates, step = selection.path[: i - 1], selection.estimates[:i], selection.path[i - 1]
+            # Two that show only together are judged together.
+            step, first = selection.path[i - 1], i - 1 - selection.path[i - 2].paired
+            now, before = self.ladder(selection.estimates[i]), self.ladder(selection.estimates[first])
+            if first and not step.paired and step.effect is not None and now[0] > before[0] and now[1] < before[1]:
+                path, estimates = selection.path[:first], selection.estimates[: first + 1]
                 found = tuple(standing(path))
                 return Selection(estimates[-1], found, path, step.ranking, estimates, None, remains=step.name)
         return selection

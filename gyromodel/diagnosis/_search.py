@@ -10,6 +10,7 @@ import numpy as np
 from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._evidence import log_sum
 from gyromodel.diagnosis._forms import MAXIMUM_LINES, addition
+from gyromodel.diagnosis._pairs import best_pair
 from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise, line_frequencies, rank_where_it_matters
 from gyromodel.diagnosis._scan import CLEARLY, Scanner
 from gyromodel.effects import Effect
@@ -38,12 +39,16 @@ TIME_MARGIN = 15.0
 
 @dataclass(frozen=True)
 class Found:
-    """One accepted addition and the ranking that spoke for it."""
+    """One accepted addition and the ranking that spoke for it.
+
+    `paired`: the first of two that show together and not alone; the next is the other.
+    """
 
     name: str
     effect: Effect | None
     rows: tuple[int, ...]
     ranking: Ranking
+    paired: bool = False
 
     @property
     def frees_noise(self) -> bool:
@@ -101,15 +106,19 @@ def search(
         remains = "bias_periodic" if full and ranking.statistic.get("bias_periodic", -np.inf) >= threshold else ""
         name, score = ranking.best(drivers=False, but=("bias_periodic" if full else "", "" if path else avoid))
         if name is None or (score < threshold and not _slow_structure(ranking, name, score, threshold, scanner.runs)):
-            break
+            both = _together(record, scanner, baseline, path, estimate, ranking, threshold, noise)
+            if not both or len(path) + 2 > MAXIMUM_ROUNDS or any(_unresolved(e, f, scanner.step) for f, e in both):
+                break
+            path += [step for step, _ in both]
+            estimates += [after for _, after in both]
+            continue
         if len(path) >= MAXIMUM_ROUNDS:
             remains = name
             break
         steps = [i for i, f in enumerate(path) if f.name == "bias_step"]
         if name == "bias_step" and len(steps) >= MAXIMUM_STEPS:
             return _before(steps[0], path, estimates)
-        step = Found(name, *addition(scanner, estimate, ranking, name, pulses), ranking)
-        after = refit(record, baseline, standing([*path, step]), noise)
+        step, after = _added(record, scanner, baseline, path, estimate, ranking, name, noise)
         small = _unresolved(after, step, scanner.step) if after is not None else ""
         if after is None or small:
             remains = name
@@ -168,6 +177,47 @@ def _unresolved(estimate: Estimate, step: Found, reading: float) -> str:
     else:
         return ""
     return f"{step.name} would be within {within} throughout, where {passes} for it: not named."
+
+
+def _added(
+    record: Record,
+    scanner: Scanner,
+    baseline: Estimate,
+    path: list[Found],
+    estimate: Estimate,
+    ranking: Ranking,
+    name: str,
+    noise: NoisePath,
+) -> tuple[Found, Estimate | None]:
+    """A candidate as the next step of a path, and the fit with it."""
+    pulses = tuple(r for f in path for r in f.rows)
+    step = Found(name, *addition(scanner, estimate, ranking, name, pulses), ranking)
+    return step, refit(record, baseline, standing([*path, step]), noise)
+
+
+def _together(
+    record: Record,
+    scanner: Scanner,
+    baseline: Estimate,
+    path: list[Found],
+    estimate: Estimate,
+    ranking: Ranking,
+    threshold: float,
+    noise: NoisePath,
+) -> list[tuple[Found, Estimate]]:
+    """Two candidates that are significant together where none is alone, with their fits; none: there are no such."""
+    pair, score = best_pair(scanner, ranking)
+    if pair is None or score < threshold:
+        return []
+    one, first = _added(record, scanner, baseline, path, estimate, ranking, pair[0], noise)
+    if first is None:
+        return []
+    one = replace(one, paired=True)
+    ranking = rank_where_it_matters(scanner, first, tuple(r for f in path for r in f.rows))
+    if ranking.statistic.get(pair[1], -np.inf) < threshold:
+        return []
+    other, both = _added(record, scanner, baseline, [*path, one], first, ranking, pair[1], noise)
+    return [] if both is None else [(one, first), (other, both)]
 
 
 def _significant_driver(ranking: Ranking, threshold: float, runs: int) -> str | None:
