@@ -357,6 +357,17 @@ def test_a_gross_error_is_told_where_it_is_in_its_file(rng: np.random.Generator)
     assert _places([50, 52], [(halved, False)]) == "at 2010 s, 2090 s"
 
 
+def test_a_bias_is_no_step_at_the_end_of_the_record() -> None:
+    rng = np.random.default_rng(0)
+    rate = rng.permutation(np.repeat(np.linspace(-50, 50, 30), 20))
+    output = 1.02 * rate + 0.05 + 0.05 * rng.standard_normal(600)
+    columns = {"time": 10.0 * np.arange(600), "rate": rate, "output": output}
+    log = gm.Campaign(columns, {"time": "s", "rate": "deg/s", "output": "deg/s"}, {"kind": "rate"})
+    found = gm.diagnose(log, gm.model_from_effects(["scale_factor"]), hold_out=False)
+    assert found.verdict == "named"
+    assert [c.effect for c in found.causes] == ["bias"]
+
+
 @pytest.mark.parametrize("slow", [0.0, 0.02])
 def test_two_effects_that_all_but_cancel_are_both_named(slow: float) -> None:
     rng, rows = np.random.default_rng(4), 1000
