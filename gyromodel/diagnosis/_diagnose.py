@@ -65,22 +65,6 @@ class _Session:
                 return Selection(estimates[-1], found, path, step.ranking, estimates, None, remains=step.name)
         return selection
 
-    def resolved(self, selection: Selection, step: float) -> Selection:
-        """The rounds, cut before an effect that is nowhere half a step of the readings large.
-
-        Readings of what moves within a step stand still, and a still reading of a moving thing is an error that
-        follows the motion: it is not the noise that the evidence weighs. No step, as of any gyro, cuts nothing.
-        """
-        for i, (done, estimate) in enumerate(zip(selection.path, selection.estimates[1:], strict=False)):
-            if step and done.effect is not None and done.effect.label in estimate.model.labels:
-                effect = estimate.model.effects[estimate.model.labels.index(done.effect.label)]
-                size = np.asarray(effect.contribution(self.record.signals))[: self.record.rows]
-                if np.abs(size).max() < 0.5 * step:
-                    path, estimates = selection.path[:i], selection.estimates[: i + 1]
-                    found = tuple(standing(path))
-                    return Selection(estimates[-1], found, path, done.ranking, estimates, None, remains=done.name)
-        return selection
-
 
 def diagnose(
     campaigns: Campaign | Sequence[Campaign],
@@ -121,7 +105,8 @@ def diagnose(
     say("laying out the search", 0.06)
     bank = build_bank(record)
     grid = _grid(record, baseline)
-    session = _Session(Scanner(record, bank, grid, stated=baseline.noise_given), SAFE_THRESHOLD)
+    scanner = Scanner(record, bank, grid, stated=baseline.noise_given, step=data.step)
+    session = _Session(scanner, SAFE_THRESHOLD)
     nulls = np.zeros(0)
     if calibrate:
         nulls = null_scores(session.scanner, baseline, calibrate, seed, say)
@@ -136,7 +121,8 @@ def diagnose(
         except EstimateError:
             grows = None
         else:
-            again = _Session(Scanner(weighted, bank, grid, stated=alike.noise_given), session.threshold)
+            scanner = Scanner(weighted, bank, grid, stated=alike.noise_given, step=data.step)
+            again = _Session(scanner, session.threshold)
             other = again.run(alike, say)
             if _unfinished(other):
                 # Structure that is left passes for a level that varies; without any left, the level passed for it.
@@ -162,12 +148,7 @@ def diagnose(
         first = selection.path[0].ranking if selection.path else selection.last
         start = _with_noise_estimated(baseline) or baseline
         selection = Selection(start, (), (), first, (start,), None)
-    whole, selection = selection, session.resolved(selection, data.step)
-    if whole is not selection:
-        findings.append(
-            f"{selection.remains} would be within half a step of the encoders ({np.rad2deg(data.step):.2g} deg) "
-            "throughout, where readings that stand still pass for it: not named."
-        )
+    findings += [selection.unresolved] if selection.unresolved else []
     if hold_out:
         say("judging each step on blocks left out", 0.62)
         selection = session.pruned(selection)
