@@ -49,10 +49,11 @@ def compensate(campaign: Campaign, calibration: Calibration) -> Campaign:
     Adds `rate_estimated` and its standard uncertainty `rate_estimated_std` (deg/s). The uncertainty holds the
     covariance of the fitted parameters and the white noise of one sample, as far as the calibration knows them
     (metadata `rate_estimated_std_holds`); not flicker and random walk, nor that of parameters held fixed. Both columns
-    are NaN where the output is missing, or where the model gives it at no rate on the branch through rest. Such
-    samples, those outside the calibrated ranges and what else a user must know are counted in the metadata
-    `rate_estimated_note`. A column `rate` is not needed and not used. Rates about the other axes that the model needs
-    and the campaign lacks are those of its attitude; where that is missing, so is the estimate.
+    are NaN where the output is missing, or where the model gives it, or what is within two standard deviations of its
+    noise, at no rate on the branch through rest. Such samples, those outside the calibrated ranges and what else a user
+    must know are counted in the metadata `rate_estimated_note`. A column `rate` is not needed and not used. Rates about
+    the other axes that the model needs and the campaign lacks are those of its attitude; where that is missing, so is
+    the estimate.
 
     Args:
         campaign: one axis, with the covariates that the model needs.
@@ -188,7 +189,7 @@ def told(calibration: Calibration, campaign: Campaign, counts: Counter[str]) -> 
     if lost := counts["lost"]:
         notes.append(
             f"{lost} of {present} samples have no estimated rate: on its branch through rest the model gives "
-            "their output at no rate."
+            "their output, or what two standard deviations of noise make of it, at no rate."
         )
     for name, (low, high) in calibration.validity.items():
         unit = validity_unit(name)
@@ -230,10 +231,11 @@ def _solve(
     slope = jnp.where(slope / gain > LEVEL, slope, gain)
     # Implicit function theorem: ∂rate/∂parameter = −(∂output/∂parameter)/(∂output/∂rate).
     jacobian = model.linearise(signals)[1] / slope[:, None]
-    # Where the output jumps or hardly follows the rate, no slope says how far noise reaches.
+    # Where the output jumps or hardly follows the rate, no slope says how far noise reaches. Where that is beyond all
+    # that the model gives, as at the limit of a saturated output, the rate may be any.
     noise = jnp.sqrt(white) * gain
     reach = (invert(model, signals, output + 2 * noise, rate) - invert(model, signals, output - 2 * noise, rate)) / 4
-    reach = jnp.where(jnp.isfinite(reach), reach, noise / slope)
+    rate = jnp.where(jnp.isfinite(reach), rate, jnp.nan)
     variance = jnp.sum((jacobian @ covariance) * jacobian, axis=1) + reach**2
     return rate, jnp.where(jnp.isfinite(rate), variance, jnp.nan)
 
@@ -292,7 +294,8 @@ def invert(
         far = jnp.sign(excess) * jnp.maximum(jnp.abs(excess), jnp.abs(s.rate))
         newton = s.rate - jnp.where(steep, excess / slope, far)
         size = TOLERANCE * (jnp.abs(s.rate) + jnp.abs(target))
-        close = rising & (jnp.abs(newton - s.rate) <= size) & (steep | (jnp.abs(excess) <= size))
+        # Level ground is far out soon, where a tolerance of the rate's would let any output pass for the level's.
+        close = rising & (jnp.abs(newton - s.rate) <= size) & (steep | (jnp.abs(excess) <= TOLERANCE * jnp.abs(target)))
         shut = high - low <= size
         middle = jnp.where(jnp.isfinite(low) & jnp.isfinite(high), (low + high) / 2, s.rate / 2)
         inside = rising & (newton > low) & (newton < high)

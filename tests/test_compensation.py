@@ -17,6 +17,7 @@ from gyromodel._checks import CampaignError
 from gyromodel.campaign import Campaign
 from gyromodel.compensation import compensate
 from gyromodel.effects import Effect
+from gyromodel.effects.converter import Saturation
 from gyromodel.effects.drivers import Bias, BiasDrift
 from gyromodel.effects.dynamics import Bandwidth, TimeDelay
 from gyromodel.effects.power_cycles import BiasTurnOn
@@ -245,6 +246,20 @@ def test_a_dead_band_hides_the_rate_and_says_so():
     assert stds(result)[~beyond] == pytest.approx(width / 2, rel=1e-3)
     assert "leaves out the uncertainty of its parameters" in note(result)
     assert result.metadata["rate_estimated_std_holds"] == "white noise of one sample"
+
+
+def test_a_saturated_output_tells_no_rate(rng: np.random.Generator):
+    """At the limit any rate beyond gives the output, and noise above it is given by none: neither by rates of 1e10."""
+    limit, noise = 1.0, 1e-6
+    model = GyroModel((ScaleFactor(value=value(7.0)), Saturation(limit=value(limit))), {"noise_white": noise})
+    truth = np.linspace(-1.5, 1.5, ROWS)
+    # Within 1e-3 standard deviations of the limit, where a tolerance of the rate's would take it for the limit.
+    output = np.clip(truth, -limit, limit) + 1e-9 * rng.standard_normal(ROWS)
+    result = compensate(bench(7 * output), Calibration(model))
+    inside = np.abs(truth) < limit - 1e-3
+    assert rates(result)[inside] == pytest.approx(truth[inside], abs=1e-8)
+    assert np.isnan(rates(result)[np.abs(truth) > limit]).all()
+    assert np.isnan(stds(result)[np.abs(truth) > limit]).all()
 
 
 @pytest.mark.long

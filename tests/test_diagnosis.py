@@ -7,7 +7,9 @@ those at 30, 50, 70 and 110 deg/s do not.
 
 from __future__ import annotations
 
+from collections import Counter
 from importlib import resources
+from itertools import combinations
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,9 +23,11 @@ from gyromodel.averages import average
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores
 from gyromodel.diagnosis._evidence import SIZES, explained_for, log_evidence_ratio
+from gyromodel.diagnosis._pairs import best_pair
 from gyromodel.diagnosis._ranking import rank
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._verdict import _places
+from gyromodel.effects.thermal import BiasWarmup
 from gyromodel.estimate import EstimateError, fit_record
 from gyromodel.model import record_span
 from gyromodel.noise import NoiseGrid, NoiseRatios, markov_sum
@@ -68,7 +72,8 @@ def test_search_statistics_equal_dense_algebra(rng: np.random.Generator) -> None
     baseline = fit_record(
         record, gm.model_from_effects(["bias"]), ratios=NoiseRatios(ratios.flicker[0], ratios.walk[0])
     )
-    result = rank(scanner, [0], baseline, (), set()).results[0]
+    ranking = rank(scanner, [0], baseline, (), set())
+    result = ranking.results[0]
 
     time = np.asarray(record.signals["time"])[:ROWS]
     inverse = np.linalg.inv(
@@ -104,6 +109,23 @@ def test_search_statistics_equal_dense_algebra(rng: np.random.Generator) -> None
         # A line's energy is interpolated over frequency next to the leading peaks.
         close = 0.1 if name == "bias_periodic" else 1e-5
         assert explained == pytest.approx(null - rss(np.hstack([ones, column])), rel=close, abs=1e-9 * null), name
+
+    # Two at a time: the catalogue effects of at most two coefficients, at the forms that are best alone.
+    blocks = scanner.bank.blocks
+    forms = Counter(b.name for b in blocks if b.kind == "effect")
+    best = {name: blocks[form] for name, (form, *_) in result.best.items() if name in forms and isinstance(form, int)}
+    best = {name: b for name, b in best.items() if b.width <= 2}
+    price = np.log((len(best) - 1) / 2)
+    together = {}
+    for one, other in combinations(best, 2):
+        columns = [scanner.bank.columns[:ROWS, b.start : b.start + b.width] for b in (best[one], best[other])]
+        t, q = null - rss(np.hstack([ones, *columns])), best[one].width + best[other].width
+        ratio = log_evidence_ratio(np.array(t), null, ROWS - 1, q)
+        together[frozenset((one, other))] = float(ratio) - price - np.log(forms[one] * forms[other])
+    pair, score = best_pair(scanner, ranking)
+    assert pair
+    assert frozenset(pair) == max(together, key=lambda k: together[k])
+    assert score == pytest.approx(max(together.values()), abs=1e-5)
 
 
 def test_evidence_ratio_is_the_integral_over_the_amplitude() -> None:
@@ -195,6 +217,30 @@ def test_calibration_is_kept_by_design(rng: np.random.Generator, tmp_path, monke
     drawn = len(said)
     assert np.array_equal(null_scores(scanner, baseline, 128, 1, lambda line, done: said.append(line)), scores)
     assert len(said) == drawn
+
+
+def test_a_fold_does_not_search_what_only_the_rows_left_out_would_tell(rng: np.random.Generator) -> None:
+    """A warm-up that was over before the fold begins is a pulse in its first row, of an amplitude beyond bounds."""
+    record = read_signals(static_log(rng))
+    ratios = NoiseRatios(jnp.zeros(1), jnp.zeros(1))
+    grid = NoiseGrid(ratios, np.zeros(1), record.interval, record_span(record))
+    first = record.rows // 5
+    fold = Scanner(record, build_bank(record), grid).without(np.arange(first), [0])
+    residual = rng.standard_normal(len(fold.present))
+    residual[first] += 50.0
+    form = fold.run([0], np.ones((len(residual), 1)), np.where(fold.present, residual, 0.0), {})[0].best["bias_warmup"][
+        0
+    ]
+    assert isinstance(form, int)
+    effect = fold.bank.blocks[form].effect
+    assert isinstance(effect, BiasWarmup)
+    assert float(record.signals["time_on"][first]) < 9.0 * float(effect.time_constant)
+
+
+def test_a_warm_up_that_was_over_is_not_searched() -> None:
+    time = jnp.arange(100.0) * 10.0
+    assert BiasWarmup.candidates({"time_on": time + 1e5}) == []
+    assert min(float(e.time_constant) for e in BiasWarmup.candidates({"time_on": time + 600.0})) >= 50.0 * (1 - 1e-9)
 
 
 def test_ring_laser_table_is_four_points_or_a_curve() -> None:
@@ -334,6 +380,37 @@ def test_a_gross_error_is_told_where_it_is_in_its_file(rng: np.random.Generator)
     halved, together = average(second, ROWS // 2)
     assert together == 2
     assert _places([50, 52], [(halved, False)]) == "at 2010 s, 2090 s"
+
+
+def test_a_bias_is_no_step_at_the_end_of_the_record() -> None:
+    rng = np.random.default_rng(0)
+    rate = rng.permutation(np.repeat(np.linspace(-50, 50, 30), 20))
+    output = 1.02 * rate + 0.05 + 0.05 * rng.standard_normal(600)
+    columns = {"time": 10.0 * np.arange(600), "rate": rate, "output": output}
+    log = gm.Campaign(columns, {"time": "s", "rate": "deg/s", "output": "deg/s"}, {"kind": "rate"})
+    found = gm.diagnose(log, gm.model_from_effects(["scale_factor"]), hold_out=False)
+    assert found.verdict == "named"
+    assert [c.effect for c in found.causes] == ["bias"]
+
+
+@pytest.mark.parametrize("slow", [0.0, 0.02])
+def test_two_effects_that_all_but_cancel_are_both_named(slow: float) -> None:
+    rng, rows = np.random.default_rng(4), 1000
+    window = np.hanning(150)
+    shared, own = (np.convolve(rng.normal(size=rows + 149), window, "valid") for _ in range(2))
+    shared, own = shared / shared.std(), own / own.std()
+    supply = shared + 0.3 * own
+    output = 3 + 0.15 * (supply - shared) + 0.05 * (rng.normal(size=rows) + slow * np.cumsum(rng.normal(size=rows)))
+    columns = {"temperature": 25 + 10 * shared, "supply_voltage": 5 + 0.2 * supply, "output": output}
+    units = {"time": "s", "temperature": "degC", "supply_voltage": "V", "output": "deg/h"}
+    campaign = gm.Campaign({"time": 10.0 * np.arange(rows), **columns}, units, {"kind": "rate"})
+    found = gm.diagnose(campaign, gm.model_from_effects(["bias"]), hold_out=False)
+    assert found.verdict == "named"
+    assert {c.effect for c in found.causes} == {"bias_temperature", "bias_supply_voltage"}
+    assert any("show together and hardly alone" in line for line in found.findings)
+    sizes = {c.effect: c.parameters[0] for c in found.causes}
+    for name, truth in (("bias_temperature", -0.015), ("bias_supply_voltage", 0.75)):
+        assert abs(sizes[name].value - truth) < 4 * sizes[name].std
 
 
 def test_many_steps_are_a_function_of_time_and_no_cause(rng: np.random.Generator) -> None:

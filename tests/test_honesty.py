@@ -11,6 +11,8 @@ import pytest
 import gyromodel as gm
 from gyromodel.averages import average
 from gyromodel.diagnosis._isolation import settling_test
+from gyromodel.diagnosis._points import dwells_apart
+from gyromodel.effects.drivers import BiasColumn
 from gyromodel.model import ModelError
 from gyromodel.model_files import read_model, write_model
 from gyromodel.signals import rate_output, read_signals
@@ -180,6 +182,39 @@ def test_nothing_is_left_out_silently(seed: int, rng: np.random.Generator) -> No
     for column in "abcd":
         for name in (f"bias_{column}", f"smooth({column})"):
             assert name in found.searched or name in found.not_testable
+
+
+def test_a_size_that_changes_with_temperature_is_not_passed_over(rng: np.random.Generator) -> None:
+    """A product of temperature with the fourth of the columns, of 45 standard deviations."""
+    temperature = 20 + 15 * np.sin(TIME / 380)
+    sway = dict(zip("abcd", rng.choice([-1.0, 0.0, 1.0], size=(4, ROWS)), strict=True))
+    output = 2 * sway["d"] + 0.3 * (temperature - 20) * sway["d"] + rng.normal(size=ROWS)
+    model = gm.model_from_effects(["bias", "bias_temperature"]).with_effect(BiasColumn(column="d"))
+    found = gm.diagnose(campaign(output, temperature=temperature, **sway), model, hold_out=False)
+    assert found.verdict == "unknown"
+    assert found.driver is not None
+    assert found.driver.column == "temperature and d"
+
+
+def dwells(rng: np.random.Generator, shift: float) -> gm.Campaign:
+    """Thirty dwells of eight samples in noise of 1 deg/h, two of them shifted."""
+    rate = np.repeat(rng.permutation(np.linspace(-60.0, 60.0, 30)), 8)
+    output = rate + (rng.normal(size=ROWS) + shift * (np.arange(ROWS) // 8 == 7)) / 3600
+    output -= 1.3 * shift * (np.arange(ROWS) // 8 == 20) / 3600
+    return campaign(output, unit="deg/s", rate=rate)
+
+
+@pytest.mark.parametrize(("shift", "said"), [(6.0, True), (0.0, False)])
+def test_dwells_that_stand_apart_are_told_of(shift: float, said: bool, rng: np.random.Generator) -> None:
+    """Noise that is estimated may take them for its own; drifts and walks are no such dwells."""
+    model = gm.model_from_effects(["scale_factor", "bias"])
+    sentence = dwells_apart(gm.fit(dwells(rng, shift), model), "deg/h")
+    assert (sentence is not None) == said
+    if sentence is not None:
+        assert sentence.startswith("The means of 2 dwells stand apart")
+    walk = dwells(rng, 0.0)
+    slow = walk.columns["output"] + np.cumsum(rng.normal(size=ROWS)) / 3600
+    assert dwells_apart(gm.fit(walk.with_column("output", slow, "deg/s"), model), "deg/h") is None
 
 
 def late_thermometer(

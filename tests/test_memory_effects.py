@@ -9,7 +9,7 @@ import pytest
 
 import gyromodel as gm
 from gyromodel.compensation import compensate
-from gyromodel.diagnosis._variance import steps_of_output
+from gyromodel.diagnosis._variance import steps_of_output, stretch_still
 from gyromodel.effects.memory import BiasThermalHysteresis
 from gyromodel.effects.thermal import TemperatureLag
 from gyromodel.estimate import Calibration
@@ -177,3 +177,20 @@ def test_steps_of_the_output_are_said_of(quantum: float, said: bool, rng: np.ran
     sentence = steps_of_output(campaign)
     assert (sentence is not None) == said
     assert sentence is None or f"steps of {quantum:.5g} deg/s" in sentence
+
+
+@pytest.mark.parametrize(
+    ("quantum", "repeats", "said"), [(0.0, 4, False), (0.0, 5, True), (0.05, 6, False), (0.05, 40, True)]
+)
+def test_a_stretch_that_stands_still_is_said_of(quantum: float, repeats: int, said: bool, rng: np.random.Generator):
+    """A dead stretch under noise of 0.05 deg/s; coarse steps repeat by chance, so that it takes more of them."""
+    output = 0.3 + 0.05 * rng.standard_normal(400)
+    output = rounded(output, quantum) if quantum else output
+    output[100 : 100 + repeats] = 0.25
+    output[300:310] = np.nan
+    campaign = gm.Campaign(
+        {"time": np.arange(400.0), "output": output}, {"time": "s", "output": "deg/s"}, {"kind": "rate"}
+    )
+    sentence = stretch_still(campaign)
+    assert (sentence is not None) == said
+    assert quantum or sentence is None or f"0.25 deg/s in data rows 101 to {100 + repeats} of" in sentence

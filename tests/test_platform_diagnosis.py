@@ -27,7 +27,7 @@ from gyromodel.model import GyroModel, ModelError, make_effect, model_from_effec
 from gyromodel.model_files import read_model, write_model
 from gyromodel.platform import fit_vibration, vibration_record
 from gyromodel.units import from_internal
-from tests.truth.platform_designs import late_and_tilted, simulation_with_friction, vibration
+from tests.truth.platform_designs import in_steps, late_and_tilted, simulation_with_friction, sticking, vibration
 
 NOTHING = model_from_effects([])
 PLATFORM = sorted(name for name, kind in CATALOGUE.items() if kind.domain == "platform")
@@ -96,6 +96,27 @@ def test_a_large_delay_is_no_slope(seed: int):
     assert [c.effect for c in diagnosis.causes] == ["sync_delay"]
     delay, std = values(diagnosis)["sync_delay.delay"]
     assert delay == pytest.approx(60.0, abs=5 * std)
+
+
+def test_friction_that_sticks_has_no_other_name(seed: int):
+    """What the redundant gimbal sticks by follows the motion as tilts, encoders and delays do."""
+    diagnosis = found(sticking(seed))
+    assert (diagnosis.verdict, [c.effect for c in diagnosis.causes]) == ("named", ["shaft_friction"])
+
+
+def test_steps_of_encoders_are_no_friction():
+    """What rounding makes of a motion would be friction of a negative size."""
+    diagnosis = found(in_steps(2**20, seed=1))
+    assert not diagnosis.causes
+    assert diagnosis.verdict in ("unknown", "adequate")
+
+
+def test_gimbals_that_follow_the_earth_do_not_oscillate():
+    record = vibration_record(vibration()).record
+    size = np.asarray(record.signals["_gimbal_x_amplitude"])[: record.rows]
+    # Of each three small motions Z alone turns gimbal_x: roll and azimuth are turns of other shafts.
+    begins = np.flatnonzero(np.asarray(record.sampling.restart)[: record.rows])[:36:3]
+    assert np.flatnonzero(size[begins] > 0).tolist() == [2, 5, 8, 11]
 
 
 def test_one_frequency_about_one_axis_cannot_tell():

@@ -68,6 +68,34 @@ def test_logged_rates_turn_the_platform(log: Campaign):
     assert changed == pytest.approx(np.outer(-np.deg2rad(72.0) / 3600 * since, [0.0, 1.0, 0.0]), abs=3e-6)
 
 
+def test_angles_may_wrap(log: Campaign):
+    """Encoders that count from 0 to 360 deg, some of whose runs begin below zero: the same motion."""
+    wrapped = log
+    for name in log.columns:
+        if log.units[name] == "deg":
+            wrapped = wrapped.with_column(name, np.mod(log.columns[name], 360.0), "deg")
+    one, two = base_motion(log), base_motion(wrapped)
+    assert np.abs((one.base - one.table) - (two.base - two.table)).max() < 1e-9
+    assert np.ptp(two.table, axis=0).max() < np.deg2rad(1.0)
+    assert np.ptp(two.gimbals, axis=0).max() < np.deg2rad(1.0)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda c: c.with_metadata({"table_axes": "-roll, azimuth, pitch"}),
+        lambda c: c.with_metadata({"table_axes": "azimuth, roll, pitch"}),
+        lambda c: c.with_column("table_x", c.columns["table_x"], "arcsec"),
+        lambda c: c.with_column("gimbal_z", 0.0 * c.columns["gimbal_z"], "deg"),
+    ],
+    ids=["sign", "axes", "unit", "dead encoder"],
+)
+def test_axes_that_do_not_move_alike_are_refused(log: Campaign, change):
+    """They would pass for a delay of half a period, or for a mode."""
+    with pytest.raises(CampaignError, match=r"times as far as table_x, .*table_axes"):
+        base_motion(change(log))
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

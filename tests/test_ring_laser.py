@@ -195,11 +195,24 @@ def test_diagnosis_names_lock_in_and_nothing_without_it() -> None:
     assert gm.diagnose(sweep(rate, rate, 5.0, rng), simulation, hold_out=False).verdict == "adequate"
 
 
+def test_lock_in_is_told_by_rates_outside_its_band(seed: int) -> None:
+    """Steps whose least rate is three times the dead band's half width, each met four times in random order."""
+    rng = np.random.default_rng(seed)
+    levels = np.array([0.0, 300, 700, 1500, 4000, 1e4, 3e4, 9e4]) * ARCSEC
+    rate = np.repeat(np.concatenate([rng.permutation(np.r_[levels, -levels[1:]]) for _ in range(2)]), 8)
+    beat = np.sign(rate) * np.sqrt(np.maximum(rate**2 - LOCK_IN_RATE**2, 0.0))
+    simulation = gm.model_from_effects(["scale_factor", "bias"])
+    found = gm.diagnose(sweep(beat, rate, 1.0, rng), simulation, hold_out=False)
+    assert [cause.effect for cause in found.causes] == ["lock_in"]
+    told = {p.name: p for p in found.causes[0].parameters}["half_width"]
+    assert abs(told.value - 100.0) < 5 * told.std
+
+
 def test_lock_in_is_not_searched_without_small_rates(table: CubicSpline) -> None:
     signals = {"rate": jnp.deg2rad(table.knots), "time": table.knots}
     assert LockIn.candidates(signals) == []
     assert LockIn.candidates({"rate": jnp.zeros(9), "time": jnp.zeros(9)}) == []
     with resources.as_file(resources.files("gyromodel") / "data" / "ring_laser_table.csv") as path:
         found = gm.diagnose(gm.read_campaign(path), gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
-    assert "1 deg/s of rest" in found.not_testable["lock_in"]
+    assert "2 deg/s of rest" in found.not_testable["lock_in"]
     assert "dither" in found.not_testable["lock_in_dithered"]

@@ -135,6 +135,19 @@ def test_the_embedded_log(demo: VibrationTest):
     assert values["corner"] == pytest.approx(30.0, rel=0.25)
 
 
+def test_the_series_of_the_embedded_log(demo: VibrationTest):
+    """Friction of the redundant gimbal sticks, which overtones about Y tell; without Y the series hold the truth."""
+    assert demo.series is not None
+    assert demo.sticking == ("Y",)
+    assert demo.series.probability > 0.01
+    rows = {row.name: row for row in parameters(demo.series)}
+    inertia = {"X": 0.45, "Z": 0.56}
+    expected = {"time offset": 2.0} | {f"friction over inertia {a}": 0.5 / j for a, j in inertia.items()}
+    expected |= {f"dry friction over inertia {a}": 0.002 / j for a, j in inertia.items()}
+    for name, true in expected.items():
+        assert rows[name].value == pytest.approx(true, abs=2.5 * rows[name].std), name
+
+
 def test_the_readme_prints_what_the_command_does(demo: VibrationTest, capsys: pytest.CaptureFixture[str]):
     readme = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
     words = vibration_words(demo)
@@ -143,6 +156,9 @@ def test_the_readme_prints_what_the_command_does(demo: VibrationTest, capsys: py
     rows = {row.name: row for row in parameters(demo.explanations[demo.supported[0]])}
     for name in ("time offset", "friction over inertia X", "friction over inertia Z"):
         assert with_uncertainty(rows[name].value, rows[name].std, rows[name].unit) in readme
+    series = {row.name: row for row in parameters(demo.series)} if demo.series else {}
+    for name in ("time offset", "friction over inertia X", "friction over inertia Z"):
+        assert with_uncertainty(series[name].value, series[name].std, series[name].unit) in readme
 
 
 def test_one_axis_at_two_frequencies_tells_less():

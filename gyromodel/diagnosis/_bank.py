@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from gyromodel._checks import of_usual_unit, usual_unit
-from gyromodel.diagnosis._drivers import driver_names, is_no_driver, smooths, unusable
+from gyromodel.diagnosis._drivers import driver_names, is_no_driver, products, smooths, unusable
 from gyromodel.effects import CATALOGUE, Effect, Signals
 from gyromodel.effects._base import lacking
 from gyromodel.effects.drivers import BiasColumn
@@ -44,7 +44,7 @@ class Block:
 
     Forms of one `structure` differ only in the values of nonlinear parameters. `along` is what a driver's first column
     is drawn over; `least` the smallest
-    coefficient of a positive effect.
+    coefficient of a positive effect; `price` what its evidence pays (nats) for being one of many of its kind.
     """
 
     name: str
@@ -55,6 +55,7 @@ class Block:
     effect: Effect | None
     along: np.ndarray | None = field(default=None, repr=False)
     least: float = 0.0
+    price: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -129,6 +130,11 @@ def build_bank(record: Record) -> Bank:
     for name, values, shape in smooths(record):
         along[len(blocks)] = values
         blocks.append((name, "driver", shape, None))
+    many = list(products(record, {name for name, *_ in blocks}))
+    for name, values, shape in many:
+        along[len(blocks)] = values
+        blocks.append((name, "driver", shape, None))
+    priced = len(blocks) - len(many)
     order = sorted(range(len(blocks)), key=lambda i: blocks[i][2].shape[1])
     laid, start = [], 0
     for i in order:
@@ -144,6 +150,7 @@ def build_bank(record: Record) -> Bank:
                 effect,
                 along.get(i),
                 effect.least(signals) if effect is not None else 0.0,
+                float(np.log(len(many))) if i >= priced else 0.0,
             )
         )
         start += shape.shape[1]

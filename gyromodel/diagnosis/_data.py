@@ -11,7 +11,7 @@ from gyromodel._checks import CampaignError
 from gyromodel.attitude import with_reference_rates
 from gyromodel.averages import MEAN_OF_ATTITUDE, MOST_TURN, average, turning
 from gyromodel.campaign import Campaign
-from gyromodel.diagnosis._variance import steps_of_output
+from gyromodel.diagnosis._variance import steps_of_output, stretch_still
 from gyromodel.platform import is_platform, vibration_record
 from gyromodel.poses import at_rest
 from gyromodel.signals import Record, read_signals
@@ -85,7 +85,7 @@ def _of_gyro(measured: Sequence[Campaign]) -> Data:
         for g, (c, m) in zip(campaigns, shortened, strict=True)
         if m == 1 and len(c) < len(g)
     ]
-    findings += [line for c in given if (line := steps_of_output(c))]
+    findings += [line for of in (steps_of_output, stretch_still) for c in given if (line := of(c))]
     searched = tuple(c for c, _ in shortened)
     output_unit = campaigns[0].units["output"]
     if campaigns[0].metadata["kind"] != "rate":

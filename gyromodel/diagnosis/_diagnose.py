@@ -17,6 +17,7 @@ from gyromodel.diagnosis._evidence import SAFE_THRESHOLD
 from gyromodel.diagnosis._gain import ladder_error, nested_gain, no_gain, not_measured
 from gyromodel.diagnosis._isolation import settling_test
 from gyromodel.diagnosis._noise_causes import as_cause, quantisation, telegraph
+from gyromodel.diagnosis._points import dwells_apart
 from gyromodel.diagnosis._ranking import Ranking, cells_of_weight, is_driver, is_noise, noise_kinds
 from gyromodel.diagnosis._result import Candidate, Cause, Diagnosis, Gain, ParameterValue, Round
 from gyromodel.diagnosis._scan import Scanner
@@ -55,27 +56,13 @@ class _Session:
     def pruned(self, selection: Selection) -> Selection:
         """The rounds, cut where (after the first step) the error on blocks left out stops falling."""
         for i in range(2, len(selection.estimates)):
-            now, before = self.ladder(selection.estimates[i]), self.ladder(selection.estimates[i - 1])
-            if selection.path[i - 1].effect is not None and now[0] > before[0] and now[1] < before[1]:
-                path, estimates, step = selection.path[: i - 1], selection.estimates[:i], selection.path[i - 1]
+            # Two that show only together are judged together.
+            step, first = selection.path[i - 1], i - 1 - selection.path[i - 2].paired
+            now, before = self.ladder(selection.estimates[i]), self.ladder(selection.estimates[first])
+            if first and not step.paired and step.effect is not None and now[0] > before[0] and now[1] < before[1]:
+                path, estimates = selection.path[:first], selection.estimates[: first + 1]
                 found = tuple(standing(path))
                 return Selection(estimates[-1], found, path, step.ranking, estimates, None, remains=step.name)
-        return selection
-
-    def resolved(self, selection: Selection, step: float) -> Selection:
-        """The rounds, cut before an effect that is nowhere half a step of the readings large.
-
-        Readings of what moves within a step stand still, and a still reading of a moving thing is an error that
-        follows the motion: it is not the noise that the evidence weighs. No step, as of any gyro, cuts nothing.
-        """
-        for i, (done, estimate) in enumerate(zip(selection.path, selection.estimates[1:], strict=False)):
-            if step and done.effect is not None and done.effect.label in estimate.model.labels:
-                effect = estimate.model.effects[estimate.model.labels.index(done.effect.label)]
-                size = np.asarray(effect.contribution(self.record.signals))[: self.record.rows]
-                if np.abs(size).max() < 0.5 * step:
-                    path, estimates = selection.path[:i], selection.estimates[: i + 1]
-                    found = tuple(standing(path))
-                    return Selection(estimates[-1], found, path, done.ranking, estimates, None, remains=done.name)
         return selection
 
 
@@ -118,7 +105,8 @@ def diagnose(
     say("laying out the search", 0.06)
     bank = build_bank(record)
     grid = _grid(record, baseline)
-    session = _Session(Scanner(record, bank, grid, stated=baseline.noise_given), SAFE_THRESHOLD)
+    scanner = Scanner(record, bank, grid, stated=baseline.noise_given, step=data.step)
+    session = _Session(scanner, SAFE_THRESHOLD)
     nulls = np.zeros(0)
     if calibrate:
         nulls = null_scores(session.scanner, baseline, calibrate, seed, say)
@@ -133,7 +121,8 @@ def diagnose(
         except EstimateError:
             grows = None
         else:
-            again = _Session(Scanner(weighted, bank, grid, stated=alike.noise_given), session.threshold)
+            scanner = Scanner(weighted, bank, grid, stated=alike.noise_given, step=data.step)
+            again = _Session(scanner, session.threshold)
             other = again.run(alike, say)
             if _unfinished(other):
                 # Structure that is left passes for a level that varies; without any left, the level passed for it.
@@ -159,16 +148,12 @@ def diagnose(
         first = selection.path[0].ranking if selection.path else selection.last
         start = _with_noise_estimated(baseline) or baseline
         selection = Selection(start, (), (), first, (start,), None)
-    whole, selection = selection, session.resolved(selection, data.step)
-    if whole is not selection:
-        findings.append(
-            f"{selection.remains} would be within half a step of the encoders ({np.rad2deg(data.step):.2g} deg) "
-            "throughout, where readings that stand still pass for it: not named."
-        )
+    findings += [selection.unresolved] if selection.unresolved else []
     if hold_out:
         say("judging each step on blocks left out", 0.62)
         selection = session.pruned(selection)
-    findings += [line for line in (tails(selection.estimate), noise_level(selection.estimate)) if line]
+    last = selection.estimate
+    findings += [line for line in (tails(last), noise_level(last), dwells_apart(last, unit)) if line]
     say("judging", 0.65)
     scale = factor(record.input_unit, unit)
     ordinary = tuple(hold_out and session.ladder(e)[2] for e in (baseline, selection.estimate))

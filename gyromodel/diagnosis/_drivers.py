@@ -6,11 +6,11 @@ some time before.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 
 import numpy as np
 
-from gyromodel._checks import DERIVED
+from gyromodel._checks import DERIVED, thermometers
 from gyromodel.declarations import EARLIER, RATE_OF, measured
 from gyromodel.signals import Record, thermometer_rate
 from gyromodel.units import is_angle
@@ -18,6 +18,8 @@ from gyromodel.units import is_angle
 # Length scales of the smooth functions, as parts of the driver's range.
 SMOOTH_SCALES = (0.08, 0.2, 0.5)
 PAIR_SCALES = (0.25, 0.6)
+# Rates crowd where their order places one this far, of the whole range, from where its value does.
+CROWDED = 0.1
 # A column has a past worth looking at if its steps from row to row are this small beside its own variation; how long
 # before, as parts of a run.
 SLOW, LAGS = 0.05, (0.01, 0.03, 0.08)
@@ -49,6 +51,8 @@ def smooths(record: Record) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     names = driver_names(record)
     for name in (*names, "time"):
         yield from _of_one(record, f"smooth({name})", np.asarray(record.signals[name]))
+    if "rate" in names and (places := _places(record)) is not None:
+        yield "smooth(rate)", np.asarray(record.signals["rate"]), _bumps(record, places, SMOOTH_SCALES[0])
     for name in (n for n in names if n not in ("rate", "campaign") and _slow(record, n)):
         if is_angle(record.units[name]):
             continue  # it may wrap round, which is no rate of change
@@ -63,6 +67,21 @@ def smooths(record: Record) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
             for scale in PAIR_SCALES:
                 of_x, of_y = _bumps(record, x, scale), _bumps(record, y, scale)
                 yield f"smooth({a}, {b})", x, (of_x[:, :, None] * of_y[:, None, :]).reshape(len(x), -1)
+
+
+def products(record: Record, known: Container[str]) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Name, values of the first column, and product of each pair of rate or temperature with another, less those known.
+
+    All pairs as smooth functions would be too many. A product is what an effect becomes whose size follows rate or
+    temperature, such as a mass unbalance that changes with temperature.
+    """
+    names = driver_names(record) if record.domain == "gyro" else ()
+    for a in (n for n in ("rate", "temperature") if n in names):
+        alike = {a, "rate", "thermistor_resistance", *thermometers(names)} if a == "temperature" else {a, "rate_spin"}
+        for b in (n for n in names if n not in {*alike, "campaign"} and f"smooth({a}, {n})" not in known):
+            x, y = (np.asarray(record.signals[n]) for n in (a, b))
+            centred = (v - v[: record.rows].mean() for v in (x, y))
+            yield f"smooth({a}, {b})", x, np.prod(list(centred), axis=0)[:, None]
 
 
 def smooth_columns(name: str) -> tuple[str, ...]:
@@ -88,6 +107,15 @@ def _bumps(record: Record, values: np.ndarray, scale: float) -> np.ndarray:
     centres = np.linspace(0.0, 1.0, round(1.0 / scale) + 1)
     part = (values - inside.min()) / np.ptp(inside)
     return np.exp(-0.5 * ((part[:, None] - centres) / scale) ** 2)
+
+
+def _places(record: Record) -> np.ndarray | None:
+    """Number of each rate among the different ones, scaled to 0…1, where these crowd: near rest, as a rule."""
+    rate = np.asarray(record.signals["rate"])
+    different, number = np.unique(rate[: record.rows], return_inverse=True)
+    places = number / (len(different) - 1)
+    crowded = np.abs(places - (rate[: record.rows] - different[0]) / np.ptp(different)).max() > CROWDED
+    return np.pad(places, (0, len(rate) - record.rows), mode="edge") if crowded else None
 
 
 def _runs(record: Record) -> list[np.ndarray]:

@@ -77,7 +77,8 @@ class Ranking:
         """Effects that explain as much of the data as a candidate, with at most one coefficient more.
 
         Their signals hold the candidate's: no size of it would tell them apart on this campaign. A form
-        that contains another which was searched is no twin: it follows whatever that one leaves.
+        that contains another which was searched is no twin: it follows whatever that one leaves. Nor is a step one of
+        a bias, which it becomes at an end of the record.
         """
         result = self.results[self.best_cell(name)]
         _, explained, q = result.best[name]
@@ -85,7 +86,8 @@ class Ranking:
         return {
             k
             for k, (_, t, width) in result.best.items()
-            if k not in (name, "outliers") and k in self.statistic and not is_driver(k)
+            if k not in (name, "outliers", "bias_step" if name == "bias" else "")
+            and k in self.statistic and not is_driver(k)
             and width <= q + 1 and t >= least
             and not result.best.keys() & set(effect_class(k).supersedes) - {k}
         }  # fmt: skip

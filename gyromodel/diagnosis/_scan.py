@@ -28,6 +28,10 @@ from gyromodel.noise import NoiseGrid
 from gyromodel.signals import Record
 
 THREADS = 2
+# A form with less than this part of its energy in the rows kept was told by those left out.
+LOST = 1e-6
+# Standard deviations below zero that a coefficient which cannot be negative may be found at.
+CLEARLY = 4.0
 # Lines whose interpolated statistic, were it this much larger, would not pay for the search are left interpolated.
 PEAK_SLACK = 1.5
 NO_LINES = np.zeros(0)
@@ -83,9 +87,18 @@ class Scanner:
     """Evidence of a bank's candidates on one record (or the record less some rows), over noise cells."""
 
     def __init__(
-        self, record: Record, bank: Bank, grid: NoiseGrid, *, outliers: bool = True, stated: bool = False
+        self,
+        record: Record,
+        bank: Bank,
+        grid: NoiseGrid,
+        *,
+        outliers: bool = True,
+        stated: bool = False,
+        step: float = 0.0,
     ) -> None:
         self.record, self.bank, self.grid = record, bank, grid
+        # Of the readings that the output is computed from; none of a gyro.
+        self.step = step
         self.present = np.asarray(record.sampling.present)
         self.runs = int(np.asarray(record.sampling.restart).sum())
         self.steps = "bias_step" in bank.scans
@@ -108,13 +121,21 @@ class Scanner:
         self._widths = np.array([b.width for b in bank.blocks], int)
         self._positive = np.array([b.effect is not None and b.effect.positive for b in bank.blocks])
         self._least = np.array([b.least for b in bank.blocks])
+        self._price = np.array([b.price for b in bank.blocks])
+        self._lost = np.zeros(len(bank.blocks), bool)
         self.epochs = np.flatnonzero(self.present[: record.rows])[1:-1]
 
     def without(self, rows: np.ndarray, cells: list[int]) -> Scanner:
-        """The same search on the record without some rows, in some of the noise cells."""
+        """The same search on the record without some rows, in some of the noise cells.
+
+        An effect's form is left out with the rows that told it: what hardly shows in the others says nothing of them.
+        """
         other = copy(self)
         other.record = self.record.without(rows)
         other.present = np.asarray(other.record.sampling.present)
+        whole, left = (np.sum(self.bank.columns[present] ** 2, axis=0) for present in (self.present, other.present))
+        gone = np.add.reduceat((left < LOST * whole).astype(int), [b.start for b in self.bank.blocks])
+        other._lost = np.array([b.kind == "effect" for b in self.bank.blocks]) & (gone > 0)
         other.epochs = np.flatnonzero(other.present[: other.record.rows])[1:-1]
         other.cells, other.only_cells = self.cells.sampled(other.record.sampling), cells
         return other
@@ -266,14 +287,22 @@ class Scanner:
             along = vectors.transpose(0, 2, 1) @ (b / norm[:, :, None])
             t = np.sum(np.where(keep, 1.0 / np.where(keep, values, 1.0), 0.0)[:, :, None] * along**2, axis=1)
             here = slice(first, first + count)
-            small = b[:, 0] < (self._least[here] * a[:, 0, 0] * norm[:, 0] ** 2)[:, None]
-            t_of[here] = np.where(self._positive[here, None] & small, 0.0, t)
+            out = b[:, 0] < (self._least[here] * a[:, 0, 0] * norm[:, 0] ** 2)[:, None]
+            if q > 1 and self._positive[here].any():
+                # What would be clearly negative in one of its coefficients.
+                inverse = np.where(keep, 1.0 / np.where(keep, values, 1.0), 0.0)
+                sizes = vectors @ (inverse[:, :, None] * along)
+                spread = np.sqrt(np.einsum("bij,bj->bi", vectors**2, inverse))
+                noise = np.sqrt(np.maximum(batch.rss - t, 1e-300) / nu)
+                out = (sizes < -CLEARLY * spread[:, :, None] * noise[:, None, :]).any(axis=1)
+            t_of[here] = np.where(self._positive[here, None] & out, 0.0, t)
             q_of[here] = keep.sum(1)
             energy[here] = np.sum(values * keep, axis=1) / np.maximum(q_of[here], 1) * np.mean(norm**2, axis=1)
         # A form that loses more columns than the baseline contains is another form in disguise.
-        sound = q_of >= least
+        sound = (q_of >= least) & ~self._lost
         energy[~sound] = 0.0
-        ratio = np.where(sound[:, None], log_evidence_ratio(t_of, batch.rss, nu, q_of[:, None]), -np.inf)[self._order]
+        ratio = log_evidence_ratio(t_of, batch.rss, nu, q_of[:, None]) - self._price[:, None]
+        ratio = np.where(sound[:, None], ratio, -np.inf)[self._order]
         # Structures compete by their mean over shapes; the best shape of the best structure stands for the name.
         means, shapes = log_mean_of_parts(ratio, self._structure_starts)
         evidence, best = log_mean_of_parts(means, self._name_starts)

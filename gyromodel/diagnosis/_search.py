@@ -10,8 +10,9 @@ import numpy as np
 from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._evidence import log_sum
 from gyromodel.diagnosis._forms import MAXIMUM_LINES, addition
+from gyromodel.diagnosis._pairs import best_pair
 from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise, line_frequencies, rank_where_it_matters
-from gyromodel.diagnosis._scan import Scanner
+from gyromodel.diagnosis._scan import CLEARLY, Scanner
 from gyromodel.effects import Effect
 from gyromodel.estimate import Estimate, EstimateError, fit_record
 from gyromodel.model import GyroModel
@@ -38,12 +39,16 @@ TIME_MARGIN = 15.0
 
 @dataclass(frozen=True)
 class Found:
-    """One accepted addition and the ranking that spoke for it."""
+    """One accepted addition and the ranking that spoke for it.
+
+    `paired`: the first of two that show together and not alone; the next is the other.
+    """
 
     name: str
     effect: Effect | None
     rows: tuple[int, ...]
     ranking: Ranking
+    paired: bool = False
 
     @property
     def frees_noise(self) -> bool:
@@ -56,7 +61,7 @@ class Selection:
     """Where the rounds ended: the extended fit, what was added, and the ranking in which no more was significant.
 
     `left_out` holds rankings beside everything found except one, where the search has made them; `remains` names what
-    was still significant and not added.
+    was still significant and not added, `unresolved` says why if it is too small.
     """
 
     estimate: Estimate
@@ -67,6 +72,7 @@ class Selection:
     driver: str | None
     left_out: dict[int, Ranking] = field(default_factory=dict, repr=False)
     remains: str = ""
+    unresolved: str = ""
 
 
 def search(
@@ -91,7 +97,7 @@ def search(
         avoid: a name that is not to be the first.
     """
     path: list[Found] = []
-    estimates, remains = [baseline], ""
+    estimates, remains, small = [baseline], "", ""
     while True:
         estimate = estimates[-1]
         pulses = tuple(r for f in path for r in f.rows)
@@ -100,16 +106,21 @@ def search(
         remains = "bias_periodic" if full and ranking.statistic.get("bias_periodic", -np.inf) >= threshold else ""
         name, score = ranking.best(drivers=False, but=("bias_periodic" if full else "", "" if path else avoid))
         if name is None or (score < threshold and not _slow_structure(ranking, name, score, threshold, scanner.runs)):
-            break
+            both = _together(record, scanner, baseline, path, estimate, ranking, threshold, noise)
+            if not both or len(path) + 2 > MAXIMUM_ROUNDS or any(_unresolved(e, f, scanner.step) for f, e in both):
+                break
+            path += [step for step, _ in both]
+            estimates += [after for _, after in both]
+            continue
         if len(path) >= MAXIMUM_ROUNDS:
             remains = name
             break
         steps = [i for i, f in enumerate(path) if f.name == "bias_step"]
         if name == "bias_step" and len(steps) >= MAXIMUM_STEPS:
             return _before(steps[0], path, estimates)
-        step = Found(name, *addition(scanner, estimate, ranking, name, pulses), ranking)
-        after = refit(record, baseline, standing([*path, step]), noise)
-        if after is None:
+        step, after = _added(record, scanner, baseline, path, estimate, ranking, name, noise)
+        small = _unresolved(after, step, scanner.step) if after is not None else ""
+        if after is None or small:
             remains = name
             break
         if progress:
@@ -139,7 +150,74 @@ def search(
             name, score = ranking.best(drivers=False, but=("bias_periodic",))
             remains = remains or (str(name) if score >= threshold else "")
     driver = _significant_driver(ranking, threshold, scanner.runs)
-    return Selection(estimates[-1], tuple(found), tuple(path), ranking, tuple(estimates), driver, left_out, remains)
+    return Selection(
+        estimates[-1], tuple(found), tuple(path), ranking, tuple(estimates), driver, left_out, remains, small
+    )
+
+
+def _unresolved(estimate: Estimate, step: Found, reading: float) -> str:
+    """Why an effect says nothing, as it is nowhere larger than what passes for it; `reading`: the step of readings.
+
+    Readings of what moves within a step stand still, and a still reading of a moving thing is an error that follows
+    the motion: it is not the noise that the evidence weighs. Nor is what another effect may leave.
+    """
+    model, record = estimate.model, estimate.record
+    if step.effect is None or step.effect.label not in model.labels:
+        return ""
+    effect = model.effects[model.labels.index(step.effect.label)]
+    size = float(np.abs(np.asarray(effect.contribution(record.signals))[: record.rows]).max())
+    left = {e.label: e.leaves(record.signals) for e in model.effects if e.label != effect.label}
+    other = max(left, key=lambda label: left[label], default="")
+    if reading and size < 0.5 * reading:
+        within = f"half a step of the encoders ({np.rad2deg(reading):.2g} deg)"
+        passes = "readings that stand still pass"
+    elif other and size < left[other]:
+        within = f"{np.rad2deg(left[other]):.2g} deg"
+        passes = f"what sticks, which {other} leaves out, passes"
+    else:
+        return ""
+    return f"{step.name} would be within {within} throughout, where {passes} for it: not named."
+
+
+def _added(
+    record: Record,
+    scanner: Scanner,
+    baseline: Estimate,
+    path: list[Found],
+    estimate: Estimate,
+    ranking: Ranking,
+    name: str,
+    noise: NoisePath,
+) -> tuple[Found, Estimate | None]:
+    """A candidate as the next step of a path, and the fit with it."""
+    pulses = tuple(r for f in path for r in f.rows)
+    step = Found(name, *addition(scanner, estimate, ranking, name, pulses), ranking)
+    return step, refit(record, baseline, standing([*path, step]), noise)
+
+
+def _together(
+    record: Record,
+    scanner: Scanner,
+    baseline: Estimate,
+    path: list[Found],
+    estimate: Estimate,
+    ranking: Ranking,
+    threshold: float,
+    noise: NoisePath,
+) -> list[tuple[Found, Estimate]]:
+    """Two candidates that are significant together where none is alone, with their fits; none: there are no such."""
+    pair, score = best_pair(scanner, ranking)
+    if pair is None or score < threshold:
+        return []
+    one, first = _added(record, scanner, baseline, path, estimate, ranking, pair[0], noise)
+    if first is None:
+        return []
+    one = replace(one, paired=True)
+    ranking = rank_where_it_matters(scanner, first, tuple(r for f in path for r in f.rows))
+    if ranking.statistic.get(pair[1], -np.inf) < threshold:
+        return []
+    other, both = _added(record, scanner, baseline, [*path, one], first, ranking, pair[1], noise)
+    return [] if both is None else [(one, first), (other, both)]
 
 
 def _significant_driver(ranking: Ranking, threshold: float, runs: int) -> str | None:
@@ -150,8 +228,11 @@ def _significant_driver(ranking: Ranking, threshold: float, runs: int) -> str | 
 
 
 def _before(i: int, path: list[Found], estimates: list[Estimate]) -> Selection:
-    """The search as it stood before step i, from which on it followed time without a name."""
+    """The search as it stood before step i, from which on it followed time, or what leads the step, without a name."""
     ranking, driver = path[i].ranking, "smooth(time)"
+    leading, score = ranking.best(drivers=True)
+    if score > ranking.statistic[path[i].name]:
+        driver = leading
     return Selection(
         estimates[i],
         tuple(standing(path[:i])),
@@ -213,7 +294,7 @@ def refit(record: Record, baseline: Estimate, found: list[Found], noise: NoisePa
     for attempt in (model, _shapes_held(model, found)):
         try:
             # Another solver would be compiled anew for each model, and has rescued none that this one lost.
-            return fit_record(
+            after = fit_record(
                 data,
                 attempt,
                 ratios=ratios,
@@ -222,7 +303,19 @@ def refit(record: Record, baseline: Estimate, found: list[Found], noise: NoisePa
             )
         except EstimateError:
             continue
+        if not _negative(after, found):
+            return after
     return None
+
+
+def _negative(estimate: Estimate, found: list[Found]) -> bool:
+    """Whether something found is clearly below zero in a coefficient that cannot be."""
+    of = {f.effect.label for f in found if f.effect is not None and f.effect.positive}
+    std = np.sqrt(np.diag(estimate.covariance))
+    return any(
+        slot.linear and estimate.model.labels[slot.effect] in of and value < -CLEARLY * spread
+        for slot, value, spread in zip(estimate.model.slots(), np.asarray(estimate.model.vector()), std, strict=True)
+    )
 
 
 def _shapes_held(model: GyroModel, found: list[Found]) -> GyroModel:
@@ -312,7 +405,7 @@ def _exchange(
             if len(standing(changed)) < len(changed):
                 continue
             after = refit(record, baseline, changed, noise)
-            if after is not None:
+            if after is not None and not _unresolved(after, step, scanner.step):
                 found, estimate, rankings = changed, after, {i: ranking}
         return found, estimate, rankings
 

@@ -24,6 +24,8 @@ CONTRADICTED = 1e-4
 CHANGED = 1.2
 # Steps of the output are said of where each level comes so often, or from this part of the output's scatter on.
 OFTEN, COARSE = 50, 0.5
+# A stretch that stands still is said of from so many repeats on, and where its other values make it less likely.
+FEWEST_REPEATS, CHANCE = 4, 1e-4
 
 
 def variance_drivers(record: Record) -> dict[str, np.ndarray]:
@@ -146,6 +148,23 @@ def steps_of_output(campaign: Campaign) -> str | None:
     return (
         f"The output comes in steps of {step:.5g} {campaign.units[name]}, {step / scatter:.2g} times its scatter from "
         "sample to sample: its quantisation counts as white noise."
+    )
+
+
+def stretch_still(campaign: Campaign) -> str | None:
+    """A sentence where the output repeats one value for longer than its other values make likely."""
+    name = campaign.outputs[0]
+    values = campaign.columns[name]
+    edges = np.flatnonzero(np.concatenate([[True], values[1:] != values[:-1], [True]]))
+    longest = int(np.argmax(np.diff(edges)))
+    start, stop = edges[longest : longest + 2]
+    repeats = stop - start - 1
+    others = (len(values) - len(edges) + 1 - repeats + 1) / len(values)
+    if repeats < FEWEST_REPEATS or np.log(len(values)) + repeats * np.log(others) > np.log(CHANCE):
+        return None
+    return (
+        f"The output stands at {values[start]:.6g} {campaign.units[name]} in data rows {start + 1} to {stop} of "
+        f"{campaign.name}: check whether sensor and logger were alive, as steps at its ends would be theirs."
     )
 
 

@@ -112,6 +112,12 @@ def judge(
     if given_up and not scanner.by_points:
         what = f"{len(given_up)} gross errors" if len(given_up) > 1 else "A gross error"
         findings.append(f"{what} {_places(given_up, searched)}: given up, not modelled.")
+    for one, other in zip(selection.path, selection.path[1:], strict=False):
+        if one.paired and {one.name, other.name} <= {step.name for step in found}:
+            findings.append(
+                f"{one.name} and {other.name} show together and hardly alone: much alike on this campaign, they all "
+                "but cancel."
+            )
     for i, step in enumerate(found):
         ranking, name = selection.left_out.get(i), step.name
         if ranking is None and len(found) > 1 and not uncontested(step):

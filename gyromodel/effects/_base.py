@@ -68,7 +68,7 @@ class Effect(eqx.Module):
     and may depend on the nonlinear ones; the contribution is columns @ coefficients, so zero coefficients are exactly
     the model without it.
     `supersedes` lists effects that this one contains as a special case; `held` the fields that physics
-    or the search fixes; `positive` says that the (only) coefficient cannot be negative; `scan` names a fast search over
+    or the search fixes; `positive` says that no coefficient can be negative; `scan` names a fast search over
     every epoch or frequency; `untested` says why a campaign leaves it no `candidates`; `remembers` that a sample's
     contribution depends on its neighbours in time; `reach` is the largest amplitude (internal units) of an effect that
     continues others.
@@ -146,6 +146,10 @@ class Effect(eqx.Module):
 
     def least(self, signals: Signals) -> float:
         """The smallest coefficient with which a `positive` form means anything: a share of one, say, not of 1e-3."""
+        return 0.0
+
+    def leaves(self, signals: Signals) -> float:
+        """Size (internal units) of what its columns may leave of it, for which other effects must not be taken."""
         return 0.0
 
     def joined(self, held: Effect) -> Self:

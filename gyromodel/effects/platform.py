@@ -218,11 +218,20 @@ class ShaftFriction(_ThroughLoop):
     needs = ("table_<axis>", "gimbal_<axis>")
     cause = "Bearings, slip rings and leads drag the platform along with its base."
     test = "Oscillate over a decade of frequency and at other amplitudes: Coulomb friction stays as it is."
+    positive = True
     untested = "no run turns a shaft of the platform"
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """Of each shaft's viscous friction, then of its Coulomb friction."""
         return self.turned(signals)
+
+    def leaves(self, signals: Signals) -> float:
+        """Twice what Coulomb friction turns the base's angle by: so far is a shaft that sticks from one that slides.
+
+        A gimbal that hardly turns, as the redundant one, sticks for much of each period.
+        """
+        dry = type(self)(jnp.zeros(0), self.coulomb, self.integral, self.lag, self.shafts)
+        return 2.0 * float(jnp.abs(dry.contribution(signals)).max())
 
     def prepared(self, signals: Signals) -> Self:
         """Both kinds of friction in every shaft that turns, unless they are set."""

@@ -18,7 +18,7 @@ from gyromodel.effects._base import Effect, Signals, parameter, stack
 
 # A wider dead band (rad/s) is no ring laser's, and its centre is off by no more than the Earth's rate and a bias.
 WIDEST, FARTHEST = np.deg2rad(1.0), np.deg2rad(20.0 / 3600.0)
-# Different rates that must lie inside the narrowest dead band searched; fewer are single bad points.
+# Visits of rates that must lie inside the narrowest dead band searched, or twice as far out; fewer are bad points.
 FEWEST_INSIDE = 3
 # How many half widths are searched, down to what part of the widest.
 WIDTHS, NARROWEST = 20, 1.0 / 300.0
@@ -43,7 +43,7 @@ class LockIn(Effect):
     test = "Sweep slowly through rest in both senses: table stiction and rate hysteresis depend on the sense."
     held = ("share",)
     positive = True
-    untested = "has fewer than three different rates within 1 deg/s of rest, or none beyond them"
+    untested = "has fewer than three visits of rates within 2 deg/s of rest, or no different ones beyond them"
 
     share: Float[Array, ""] = parameter("1", 1.0, "part of the output that locks", default=1.0)
     half_width: Float[Array, ""] = parameter("deg/h", 100.0, "half of the dead band", linear=False, default=5e-4)
@@ -64,13 +64,14 @@ class LockIn(Effect):
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
-        """Dead bands that hold several of the rates, with others beyond."""
-        rate = np.abs(np.asarray(signals["rate"]))
-        levels = np.unique(rate[rate > 0])
+        """Dead bands near several visits of rates, with other rates beyond; rates outside tell a band by ω_L²/2ω."""
+        rate = np.asarray(signals["rate"])
+        levels = np.unique(np.abs(rate[rate != 0]))
         if len(levels) < 2 * FEWEST_INSIDE:
             return []
+        visits = np.sort(np.abs(rate[np.append(True, np.diff(rate) != 0) & (rate != 0)]))
         widest = min(WIDEST, levels[-FEWEST_INSIDE - 1])
-        narrowest = max(levels[FEWEST_INSIDE - 1], NARROWEST * widest)
+        narrowest = max(visits[FEWEST_INSIDE - 1] / 2, NARROWEST * widest)
         if not narrowest < widest:
             return []
         return [

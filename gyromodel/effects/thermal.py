@@ -16,6 +16,9 @@ from gyromodel._checks import thermometers
 from gyromodel.effects._base import Effect, Signals, parameter, stack
 from gyromodel.effects._shapes import POWER_SCALE, OverTemperature, check_curve, curve_columns, curve_forms
 
+# Time constants after which nothing of a warm-up is left.
+LONG_OVER = 12.0
+
 
 class BiasTemperature(OverTemperature):
     """E += D_T (T − T0): bias proportional to temperature."""
@@ -217,6 +220,7 @@ class BiasWarmup(Effect):
     needs = ("time",)
     cause = "Electronics, source or coil settle after power-on."
     test = "Repeat the start: a warm-up comes back, a random walk does not."
+    untested = "the run begins so long after power-on that what could be seen to decay in it has decayed before"
 
     amplitude: Float[Array, ""] = parameter("deg/h", 1.0, "bias at power-on")
     time_constant: Float[Array, ""] = parameter("s", 600.0, "decay time", linear=False, default=600.0)
@@ -231,8 +235,8 @@ class BiasWarmup(Effect):
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
-        """Time constants from some samples to the whole run."""
+        """Time constants from some samples to the whole run, of which something is left when the run begins."""
         on = np.asarray(signals["time_on"])
         span = float(on.max() - on.min())
-        shortest = max(span / 200.0, 2.0 * float(np.median(np.diff(on))))
-        return [cls(time_constant=tau) for tau in np.geomspace(shortest, span, 14)]
+        shortest = max(span / 200.0, 2.0 * float(np.median(np.diff(on))), float(on.min()) / LONG_OVER)
+        return [] if shortest > span else [cls(time_constant=tau) for tau in np.geomspace(shortest, span, 14)]

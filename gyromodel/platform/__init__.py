@@ -10,7 +10,7 @@ from gyromodel.platform._acceptance import (
     judge_phase,
     limits_at,
 )
-from gyromodel.platform._assessment import VibrationTest, parameters, vibration_test
+from gyromodel.platform._assessment import EXCLUDED, VibrationTest, parameters, vibration_test
 from gyromodel.platform._campaign import navigate_campaign
 from gyromodel.platform._drift import residual_drift
 from gyromodel.platform._earth import EARTH_RATE, earth_rate, gravity, radii, transport_rate
@@ -42,12 +42,14 @@ from gyromodel.platform._navigation import Navigation, attitudes, navigate
 from gyromodel.platform._record import VibrationRecord, fit_vibration, vibration_record
 from gyromodel.platform._responses import Response, responses
 from gyromodel.platform._sensitivity import attitude_sensitivity
+from gyromodel.platform._series import fit_series
 from gyromodel.platform._simulation import Axis, simulate_axis
 from gyromodel.platform._vibration import PublishedResponse, SineFit, fit_sines, published_response
 
 __all__ = [
     "ALTERNATIVES",
     "EARTH_RATE",
+    "EXCLUDED",
     "FREQUENCIES",
     "GAIN_LIMIT",
     "GIMBALS",
@@ -83,6 +85,7 @@ __all__ = [
     "euler_angles",
     "euler_attitude",
     "explain",
+    "fit_series",
     "fit_sines",
     "fit_vibration",
     "gimbal_attitude",

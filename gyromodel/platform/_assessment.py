@@ -16,8 +16,9 @@ from gyromodel.estimate import EstimateError
 from gyromodel.platform._acceptance import AXES
 from gyromodel.platform._explanations import ALTERNATIVES, ENTRIES, Explanation, Points, explain, points, separation
 from gyromodel.platform._loop import Loop
-from gyromodel.platform._motion import base_motion
+from gyromodel.platform._motion import BaseMotion, base_motion
 from gyromodel.platform._responses import LEVEL, Response, responses
+from gyromodel.platform._series import fit_series
 
 # Below this probability of its sum of squares an explanation is excluded.
 EXCLUDED = 0.01
@@ -44,6 +45,8 @@ class VibrationTest:
         supported: explanations that are not excluded and not far behind, best first.
         further: of further tests of all axes, the least separation of any two of the first supported ones, in standard
             deviations.
+        series: the first supported one fitted to the angles themselves, overtones included, where they determine it.
+        sticking: axes that this fit leaves out, as overtones exclude it with them: those of friction that sticks, say.
     """
 
     responses: tuple[Response, ...]
@@ -53,6 +56,8 @@ class VibrationTest:
     scatter_stated: bool
     supported: tuple[str, ...]
     further: dict[str, float]
+    series: Explanation | None = field(default=None, repr=False)
+    sticking: tuple[str, ...] = ()
 
     @property
     def next_test(self) -> str | None:
@@ -86,6 +91,12 @@ class VibrationTest:
             "supported": list(self.supported),
             "further_tests": self.further,
             "next_test": self.next_test,
+            "series": self.series
+            and {
+                "probability": self.series.probability,
+                "axes_left_out": list(self.sticking),
+                "parameters": [row._asdict() for row in parameters(self.series)],
+            },
         }
 
 
@@ -158,9 +169,31 @@ def vibration_test(campaign: Campaign, progress: Callable[[str, float], None] | 
         if e.criterion - explanations[order[0]].criterion <= SUPPORTED
         and not (scatter_stated and e.probability < EXCLUDED)
     )
-    tell("looking for further tests", 0.6)
+    tell("fitting the series", 0.6)
+    series, sticking = _of_series(motion, found, supported, integrated > 0)
+    tell("looking for further tests", 0.8)
     further = _further({name: explanations[name] for name in supported[:RIVALS]}, at, integrated)
-    return VibrationTest(tuple(found), tuple(remarks), integrated > 0, explanations, scatter_stated, supported, further)
+    return VibrationTest(
+        tuple(found), tuple(remarks), integrated > 0, explanations, scatter_stated, supported, further, series, sticking
+    )
+
+
+def _of_series(
+    motion: BaseMotion, found: list[Response], supported: tuple[str, ...], integrated: bool
+) -> tuple[Explanation | None, tuple[str, ...]]:
+    """The fit of the series, without one axis where all together exclude it and the others do not."""
+    axes = sorted({r.axis for r in found})
+    without = [(), *((axis,) for axis in axes if len(axes) > 1)]
+    fits: list[tuple[Explanation, tuple[str, ...]]] = []
+    for left_out in without if supported else ():
+        try:
+            runs = [r for r in found if r.axis not in left_out]
+            fits.append((fit_series(motion, runs, ALTERNATIVES[supported[0]], integrated), left_out))
+        except EstimateError:
+            continue
+        if not left_out and fits[0][0].probability >= EXCLUDED:
+            break
+    return max(fits, key=lambda fit: fit[0].probability, default=(None, ()))
 
 
 def _explained(at: Points, found: list[Response], known: bool) -> dict[str, Explanation]:

@@ -6,8 +6,9 @@ A time offset between the records, viscous friction through the loop and a reson
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -44,6 +45,9 @@ RUNAWAY = 100.0
 # with two integrators.
 QUICK = {"correction": 5.0, "corner": 120.0}
 DOUBLE = {"correction": 5.5, "corner": 48.0, "second_corner": 48.0}
+
+
+Linearise = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 class Alternative(NamedTuple):
@@ -183,9 +187,10 @@ def explain(
     n, known = len(gain), gain_std is not None
     std = np.concatenate([np.ones(n) if x is None else x for x in (gain_std, phase_std)])
     measured, groups = np.concatenate([gain, phase]), None if known else np.repeat([0, 1], n)
-    found = _physical(alternative, at, measured, signed, std, groups)
+    columns = tested(alternative, at)
+    found = physical(columns, partial(_linearise, _data(alternative, at, signed)), measured, std, groups)
     squares = np.mean((found.residual / std).reshape(2, n) ** 2, axis=1)
-    k = _tested(alternative, at).shape[1] + 2 * (not known)
+    k = columns.shape[1] + 2 * (not known)
     corrected = 2 * k * (k + 1) / (2 * n - k - 1) if 2 * n > k + 1 else np.inf
     cost = n * float(squares.sum()) if known else n * float(np.log(squares).sum()) + corrected
     scatter = np.sqrt(np.mean(std.reshape(2, n) ** 2, axis=1)) if known else found.scatter
@@ -225,7 +230,8 @@ def separation(
     exact = np.asarray(_predicted(jnp.asarray(truth.value), _data(truth.alternative, at, sign)))
     std = np.repeat(truth.scatter, n)
     # Of one unknown factor, which does not change the fit: no test of whether its size is probable.
-    found = _physical(rival, at, exact, sign, std, np.zeros(2 * n, int))
+    linearise = partial(_linearise, _data(rival, at, sign))
+    found = physical(tested(rival, at), linearise, exact, std, np.zeros(2 * n, int))
     return float(np.linalg.norm(found.residual / std))
 
 
@@ -246,16 +252,21 @@ def _data(alternative: Alternative, at: Points, signed: bool | np.ndarray) -> _D
     return _Data(at, arrays[0], Loop(**alternative.loop), *arrays[1:])
 
 
+def loop_and_mount(entry: Array, data: Any, axis: Array, amplifier: Array, dry: Array) -> tuple[Loop, Mount]:
+    """Those of an axis by all entries, `dry` added to the friction; data: of `_Data` the last three."""
+    corner = jnp.where(data.integrating > 0, entry[13], data.loop.corner)
+    changed = entry[3:6][axis] + dry, amplifier * data.loop.amplifier, corner
+    loop = eqx.tree_at(lambda x: (x.friction, x.amplifier, x.corner), data.loop, changed)
+    return loop, Mount(entry[:3][axis], entry[9:12][axis], entry[12], data.grounded)
+
+
 def _predict(entry: Array, data: _Data) -> Array:
     """Gains and then phases."""
-    corner = jnp.where(data.integrating > 0, entry[13], data.loop.corner)
 
     def one(axis, frequency, amplifier, integrated, amplitude):
         # Of the torque M sign(ω) of a body that slides, the part that goes with the rate is 4M/(π ω̂).
-        friction = entry[3:6][axis] + 4 / jnp.pi * entry[6:9][axis] / (frequency * amplitude)
-        changed = friction, amplifier * data.loop.amplifier, corner
-        loop = eqx.tree_at(lambda x: (x.friction, x.amplifier, x.corner), data.loop, changed)
-        mount = Mount(entry[:3][axis], entry[9:12][axis], entry[12], data.grounded)
+        dry = 4 / jnp.pi * entry[6:9][axis] / (frequency * amplitude)
+        loop, mount = loop_and_mount(entry, data, axis, amplifier, dry)
         return measured_response(loop, mount, frequency[None], integrated)[0]
 
     response = jax.vmap(one)(*data.at)
@@ -273,14 +284,21 @@ def _linearised(entry: Array, data: _Data) -> tuple[Array, Array]:
     return _predict(entry, data), jax.jacfwd(_predict)(entry, data)
 
 
-def _tested(alternative: Alternative, at: Points) -> np.ndarray:
-    """The columns that axes of the test have a part in."""
+def _linearise(data: _Data, entry: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    value, jacobian = _linearised(jnp.asarray(entry), data)
+    return np.asarray(value), np.asarray(jacobian)
+
+
+def tested(alternative: Alternative, at: Any) -> np.ndarray:
+    """The columns that axes of the test (`at.axis`) have a part in."""
     seen = np.concatenate([np.tile(np.isin(range(len(AXES)), at.axis), 4), [True, True]])
     columns = alternative.columns
     return columns[:, columns[seen].any(axis=0)]
 
 
-class _Fit(NamedTuple):
+class Fit(NamedTuple):
+    """Entries with their standard uncertainties, scatter of each group, and what is left."""
+
     value: Float[np.ndarray, " entry"]
     std: Float[np.ndarray, " entry"]
     scatter: Float[np.ndarray, " group"]
@@ -288,18 +306,23 @@ class _Fit(NamedTuple):
     sum_of_squares: float
 
 
-def _physical(
-    alternative: Alternative,
-    at: Points,
-    measured: np.ndarray,
-    signed: bool | np.ndarray,
-    std: np.ndarray,
-    groups: np.ndarray | None,
-) -> _Fit:
-    """The fit in which no entry but an offset is negative."""
-    columns, data = _tested(alternative, at), _data(alternative, at, signed)
+def physical(
+    columns: np.ndarray, linearise: Linearise, measured: np.ndarray, std: np.ndarray, groups: np.ndarray | None = None
+) -> Fit:
+    """The least-squares fit in which no entry but an offset is negative.
+
+    Args:
+        columns: entries by parameters.
+        linearise: predictions and their derivatives by all entries.
+        measured: what is predicted.
+        std: its standard deviations.
+        groups: of observations whose standard deviations have a common unknown factor; without, they are known.
+
+    Raises:
+        EstimateError: the observations do not determine the parameters.
+    """
     while True:
-        found = _fitted(columns, data, measured, std, groups)
+        found = _fitted(columns, linearise, measured, std, groups)
         size = columns.T @ SIZES
         relative = np.where(columns[:3].any(0), np.inf, columns.T @ found.value / size)
         if relative.min(initial=np.inf) >= 0:
@@ -307,15 +330,16 @@ def _physical(
         columns = np.delete(columns, relative.argmin(), axis=1)
 
 
-def _fitted(columns: np.ndarray, data: _Data, measured: np.ndarray, std: np.ndarray, groups: np.ndarray | None) -> _Fit:
-    """Least squares; groups, where given, have unknown factors of their standard deviations."""
+def _fitted(
+    columns: np.ndarray, linearise: Linearise, measured: np.ndarray, std: np.ndarray, groups: np.ndarray | None
+) -> Fit:
     known = groups is None
     groups = np.zeros(len(measured), int) if groups is None else groups
     counts = columns.sum(0)
 
     def linearised(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        predicted, jacobian = _linearised(jnp.asarray(columns @ x), data)
-        return measured - np.asarray(predicted), np.asarray(jacobian) @ columns
+        predicted, jacobian = linearise(columns @ x)
+        return measured - predicted, jacobian @ columns
 
     def normal(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         residual, jacobian = linearised(x)
@@ -348,4 +372,4 @@ def _fitted(columns: np.ndarray, data: _Data, measured: np.ndarray, std: np.ndar
         raise EstimateError("the points of the vibration test do not determine this explanation")
     spread = columns @ spread
     squares = float(np.sum((residual / (std * scatter[groups])) ** 2))
-    return _Fit(columns @ x, np.linalg.norm(spread, axis=1), scatter, residual, squares)
+    return Fit(columns @ x, np.linalg.norm(spread, axis=1), scatter, residual, squares)

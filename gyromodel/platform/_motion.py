@@ -25,6 +25,8 @@ from gyromodel.platform._navigation import attitudes
 GIMBALS = ("gimbal_y_outer", "gimbal_x", "gimbal_y", "gimbal_z")
 TABLE = tuple(f"table_{axis}" for axis in AXES)
 TURNS = ("roll", "azimuth", "pitch")
+# Ratio of two motions, and the angle (rad) between them, that are not of one axis.
+UNLIKE, AGAINST = 20.0, np.deg2rad(150.0)
 
 
 class BaseMotion(NamedTuple):
@@ -70,7 +72,8 @@ def base_motion(campaign: Campaign) -> BaseMotion:
     if not isinstance(heading := campaign.metadata.get("heading_deg", 0.0), int | float):
         raise CampaignError(f"{campaign.name}: metadata 'heading_deg' is {heading!r}, expected a number of degrees")
     mounting = _mounting(campaign)
-    table, gimbals = _known(campaign, TABLE, "rad"), _known(campaign, GIMBALS, "rad")
+    # Encoders may begin anew after a turn.
+    table, gimbals = (np.unwrap(_known(campaign, names, "rad"), axis=0) for names in (TABLE, GIMBALS))
     outputs = [f"output_{axis}" for axis in AXES]
     logged = [name in campaign.columns for name in outputs]
     if any(logged) and not all(logged):
@@ -96,6 +99,7 @@ def base_motion(campaign: Campaign) -> BaseMotion:
     # Whole turns and the heading stay out of what is compared.
     base = base - np.deg2rad(heading) * mounting[:, 1]
     base = base - 2 * np.pi * np.round((base[0] - table[0]) / (2 * np.pi))
+    _check_alike(campaign, base, table, segment)
     return BaseMotion(time, table, base, gimbals, np.asarray(platform), mounting, segment)
 
 
@@ -105,6 +109,29 @@ def _known(campaign: Campaign, names: tuple[str, ...] | list[str], unit: str) ->
         if (missing := ~np.isfinite(column)).any():
             raise CampaignError(f"{campaign.name}: {name} is missing in row {first(missing)}")
     return values
+
+
+def _check_alike(campaign: Campaign, base: np.ndarray, table: np.ndarray, segment: np.ndarray) -> None:
+    """Refuse an axis about which the base moves by another amount than the table, or against it, in every run.
+
+    Angles of other axes, signs or units look like a delay, or a mode, of a size that none has.
+    """
+    ratios: list[list[complex]] = [[], [], []]
+    for k in range(segment[-1] + 1):
+        rows = segment == k
+        window = np.hanning(rows.sum())[:, None]
+        lines = [np.fft.rfft(window * (x[rows] - x[rows].mean(0)), axis=0) for x in (base, table)]
+        axis, at = np.unravel_index(np.argmax(np.abs(lines[1].T)), lines[1].T.shape)
+        if abs(lines[1][at, axis]) > 0:
+            ratios[axis].append(lines[0][at, axis] / lines[1][at, axis])
+    for name, found in zip(TABLE, ratios, strict=True):
+        size, turned = np.abs(found), np.abs(np.angle(found))
+        if found and ((size < 1 / UNLIKE) | (size > UNLIKE) | (turned > AGAINST)).all():
+            raise CampaignError(
+                f"{campaign.name}: gimbals and navigation move {size[0]:.2g} times as far as {name}, "
+                f"{np.rad2deg(turned[0]):.0f} deg away from it: check its unit, those of the gimbals, and metadata "
+                f"table_axes, which says that X, Y, Z turn {campaign.metadata.get('table_axes', ', '.join(TURNS))}"
+            )
 
 
 def _mounting(campaign: Campaign) -> np.ndarray:

@@ -7,6 +7,7 @@ the oscillation whole. Every signal is a mean over the same samples, so that no 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -24,16 +25,23 @@ from gyromodel.platform._gimbals import GimbalErrors, base_angles
 from gyromodel.platform._motion import GIMBALS, BaseMotion, base_motion
 from gyromodel.signals import Record, laid_out
 
-# Phase (rad) of the fastest oscillation over a mean of samples, that of a record with too many rows, and their number.
-PHASE, WIDEST, MAXIMUM_ROWS = 0.7, 1.5, 12_000
-# Fewest means of a run.
-FEWEST = 24
+# Phase (rad) of the fastest oscillation over a mean of samples, that of a record with too many rows, whose fastest
+# oscillations a mean makes smaller by a sixth at most, and their number.
+PHASE, WIDEST, MAXIMUM_ROWS = 0.7, 2.0, 4_000
+# Fewest means of a run, and most groups of runs of which each is left out once.
+FEWEST, GROUPS = 24, 6
 # Variance of a stretch's own constant, over that of white noise.
 UNKNOWN = 1e6
 # A sine is one whose energy is so many times the noise's, and what else moves may be this part of it.
 SEEN, UNLIKE = 50.0, 0.05
+# What whole turns taken off leave of an angle (rad).
+ROUNDED = 1e-13
+# Steps of its encoder by which a gimbal turns if its friction is to be told.
+RESOLVED = 10
 # Times that a reading returns where the steps of an encoder show.
 OFTEN = 4
+# Change (rad) of what angles depend on, by which they are differentiated.
+NUDGE = 1e-4
 # Time between two stretches of the record in reports, s.
 PAUSE = 1.0
 
@@ -78,12 +86,12 @@ def vibration_record(campaigns: Campaign | Sequence[Campaign]) -> VibrationRecor
     runs, findings, count = [], [], 0
     for campaign in campaigns:
         motion = base_motion(campaign)
-        changes = _sensitivities(motion)
+        changes, step = _sensitivities(motion), _step(campaign)
         for k in range(motion.segment[-1] + 1):
             count += 1
             rows = np.flatnonzero(motion.segment == k)
             name = f"Run {count}" if motion.segment[-1] or len(campaigns) > 1 else "The run"
-            run = _run(motion, rows, changes)
+            run = _run(motion, rows, changes, step)
             if isinstance(run, str):
                 findings.append(f"{name} was left out: {run}.")
             else:
@@ -101,7 +109,8 @@ def vibration_record(campaigns: Campaign | Sequence[Campaign]) -> VibrationRecor
             f"Means of up to {max(together)} consecutive samples were searched, shorter ones in faster runs."
         )
     columns = {name: np.concatenate([s[name] for s in stretches]) for name in stretches[0]}
-    blocks, scheme = np.concatenate(numbers), "runs"
+    blocks = np.concatenate(numbers) % GROUPS
+    scheme = "runs" if len(runs) <= GROUPS else "groups of runs"
     if len(runs) < 4:
         parts = np.concatenate([np.arange(len(s["time"])) * 5 // len(s["time"]) for s in stretches])
         blocks, scheme = 5 * blocks + parts, "fifths of a run"
@@ -136,8 +145,8 @@ class _Run(NamedTuple):
     turns: list[tuple[np.ndarray, float]]
 
 
-def _run(motion: BaseMotion, rows: np.ndarray, changes: np.ndarray) -> _Run | str:
-    """A run, or why it cannot be used."""
+def _run(motion: BaseMotion, rows: np.ndarray, changes: np.ndarray, step: float) -> _Run | str:
+    """A run, read by encoders of some step, or why it cannot be used."""
     time = motion.time[rows] - motion.time[rows[0]]
     if len(rows) < FEWEST:
         return f"it has {len(rows)} rows, and {FEWEST} are needed"
@@ -148,7 +157,9 @@ def _run(motion: BaseMotion, rows: np.ndarray, changes: np.ndarray) -> _Run | st
         if left > UNLIKE:
             return f"the motion of table_{axis} is no oscillation of one frequency"
         waves.append((wave, frequency))
-    turns = [_sine(time, angle)[:2] for angle in gimbals.T]
+    # Gimbals follow the Earth as well; what turns by few steps of its encoder is taken to stand still.
+    turns = [_sine(time, angle, drifts=True)[:2] for angle in gimbals.T]
+    turns = [(w, f) if np.abs(w[0]) > RESOLVED * step else (0.0 * w, 0.0) for w, f in turns]
     output = motion.base[rows] - table
     # Where the platform began is known to a reading: it is turned so that mean angles agree.
     turn = _aligning(changes, output[..., None])
@@ -232,38 +243,44 @@ def _stretches(run: _Run, phase: float) -> list[dict[str, np.ndarray]]:
     return stretches
 
 
-def _sine(time: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, float, float]:
+def _sine(time: np.ndarray, angle: np.ndarray, drifts: bool = False) -> tuple[np.ndarray, float, float]:
     """The oscillation z of an angle Re z + constant, its angular rate, and what part of the angle's motion it leaves.
 
-    Zero where none is seen. The frequency is that of the largest line of the spectrum, by Gauss-Newton steps.
+    The constant is a line where the angle drifts. Zero where no oscillation is seen. The frequency is that of the
+    largest line of the spectrum, by Gauss-Newton steps.
     """
     n, span = len(time), float(time[-1])
+    middle = time - 0.5 * span
+    if drifts:
+        angle = angle - np.polyval(np.polyfit(middle, angle, 1), middle)
     still = np.zeros(n, complex), 0.0, 0.0
     padded = 8 * n
     frequencies = 2 * np.pi * np.arange(padded // 2 + 1) / padded * (n - 1) / span
     even = np.interp(np.linspace(0.0, span, n), time, angle)
     power = np.abs(np.fft.rfft(even - even.mean(), padded)) ** 2
-    # Slower than three quarters of a period is a drift; towards half the sample rate cosine and sine grow alike.
-    inside = slice(6, padded // 4)
+    # Slower than three quarters of a period is a drift; at half the sample rate cosine and sine are alike.
+    inside = slice(6, int(0.45 * padded))
     w = float(frequencies[inside][np.argmax(power[inside])])
     low, high = w - np.pi / (2 * span), w + np.pi / (2 * span)
-    middle = time - 0.5 * span
+    line = np.polynomial.polynomial.polyvander(middle, int(drifts))
     for _ in range(12):
-        waves = np.column_stack([np.cos(w * middle), np.sin(w * middle), np.ones(n)])
-        a, b, constant = np.linalg.lstsq(waves, angle, rcond=None)[0]
+        waves = np.column_stack([np.cos(w * middle), np.sin(w * middle), line])
+        found = np.linalg.lstsq(waves, angle, rcond=None)[0]
+        a, b = found[:2]
         slope = middle * (b * waves[:, 0] - a * waves[:, 1])
-        steps = np.linalg.lstsq(np.column_stack([waves, slope]), angle - waves @ [a, b, constant], rcond=None)[0]
-        w = float(np.clip(w + steps[3], low, high))
+        steps = np.linalg.lstsq(np.column_stack([waves, slope]), angle - waves @ found, rcond=None)[0]
+        w = float(np.clip(w + steps[-1], low, high))
     z = (a - 1j * b) * np.exp(1j * w * middle)
-    left = angle - constant - z.real
+    left = angle - line @ found[2:] - z.real
     # White noise shows in differences, a motion does not.
     noise = 0.5 * float(np.mean(np.diff(left) ** 2))
-    if 0.5 * n * abs(z[0]) ** 2 <= SEEN * max(noise, np.finfo(float).eps ** 2):
+    if 0.5 * n * abs(z[0]) ** 2 <= SEEN * max(noise, ROUNDED**2):
         return still
     return z, w, float(np.sqrt(max(np.mean(left**2) - 2.0 * noise, 0.0) / np.mean(z.real**2)))
 
 
 @jax.jit
+@partial(jax.vmap, in_axes=(0, None, None, None))
 def _changed(
     by: Float[Array, " change"],
     platform: Float[Array, "sample 4"],
@@ -275,18 +292,20 @@ def _changed(
     return base_angles(turned, gimbals + by[6:10], mounting, errors)
 
 
-_derivatives = jax.jit(jax.jacfwd(_changed))
-
-
 def _sensitivities(motion: BaseMotion) -> Float[np.ndarray, "sample 3 change"]:
-    """By turns in navigation axes, turns about axes of the body, readings of the gimbals, and tilts of their axes."""
+    """By turns in navigation axes, turns about axes of the body, readings of the gimbals, and tilts of their axes.
+
+    From changes of ±NUDGE, which miss a 10⁻⁸ of them: derivatives took three times as long to compile.
+    """
     rows = len(motion.time)
     # Of a length that recurs.
     extra = -rows % 4096
     platform, gimbals = (
         jnp.asarray(np.pad(x, ((0, extra), (0, 0)), mode="edge")) for x in (motion.platform, motion.gimbals)
     )
-    return np.asarray(_derivatives(jnp.zeros(18), platform, gimbals, jnp.asarray(motion.mounting)))[:rows]
+    nudges = NUDGE * np.eye(18)
+    up, down = (np.asarray(_changed(by, platform, gimbals, jnp.asarray(motion.mounting))) for by in (nudges, -nudges))
+    return np.moveaxis((up - down)[:, :rows] / (2 * NUDGE), 0, -1)
 
 
 def _shown(campaign: Campaign, columns: dict[str, np.ndarray], run: np.ndarray) -> Campaign:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from gyromodel.platform import Points, assumed_loop, margins, parameters, predicted
+from gyromodel.platform import EXCLUDED, Points, assumed_loop, margins, parameters, predicted
 from gyromodel.report import _drawing as draw
 from gyromodel.report._numbers import with_uncertainty
 
@@ -67,11 +67,15 @@ def _lines(test: VibrationTest) -> list[str]:
     excluded = "" if test.scatter_stated else " (the standard errors above exclude every explanation offered here)"
     lines += ["", f"What explains all runs, judged by {judged}{excluded}:"]
     for name in test.supported:
-        found = test.explanations[name]
-        values = ", ".join(f"{row.name} {with_uncertainty(row.value, row.std, row.unit)}" for row in parameters(found))
-        lines.append(f"- {name}: {values or 'nothing of it is seen'}.")
+        lines.append(f"- {name}: {_values(test.explanations[name])}.")
     rest = len(test.explanations) - len(test.supported)
     lines.append(f"{rest} others are {'excluded or ' if test.scatter_stated else ''}far less likely (vibration.json).")
+    if test.series is not None:
+        without = f", without axis {test.sticking[0]}, where something sticks," if test.sticking else ""
+        if test.series.probability < EXCLUDED:
+            lines.append("Overtones in the angles exclude the first of these: something sticks, or is not of one size.")
+        else:
+            lines.append(f"From the angles themselves, overtones included{without} the first: {_values(test.series)}.")
     lines.append("Values hold for the loop that each explanation assumes, the first one's in loop.svg.")
     if test.next_test:
         apart = f"{test.further[test.next_test]:.1f} standard deviations apart (3.3 are enough)"
@@ -79,6 +83,11 @@ def _lines(test: VibrationTest) -> list[str]:
     elif len(test.supported) > 1:
         lines.append("These cannot be told apart, nor by any further test tried.")
     return lines
+
+
+def _values(found: Explanation) -> str:
+    rows = [f"{row.name} {with_uncertainty(row.value, row.std, row.unit)}" for row in parameters(found)]
+    return ", ".join(rows) or "nothing of it is seen"
 
 
 def vibration_figures(test: VibrationTest) -> dict[str, str]:

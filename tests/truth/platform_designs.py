@@ -105,14 +105,30 @@ def late_and_tilted(delay: float, tilt: float, seed: int = 0) -> Campaign:
     return logged(_simulated("gimbal_nonorthogonality", tilt), hidden("sync_delay", delay), seed)
 
 
+@cache
+def _sticking() -> Run:
+    return platform.simulate(FREE._replace(viscous=np.full(4, 0.1), coulomb=np.full(4, 0.05)), *common(), LENGTH)
+
+
+def sticking(seed: int) -> Campaign:
+    """Friction of which the redundant gimbal, which hardly turns, sticks for most of each period."""
+    return logged(_sticking(), FREE, seed)
+
+
+def in_steps(steps: int, seed: int) -> Campaign:
+    """Nothing hidden, read by encoders of so many steps a turn and without noise."""
+    return logged(_simulated("", 0.0), FREE._replace(quantum=2 * np.pi / steps), seed)
+
+
 def logged(run: Run, design: Platform, seed: int) -> Campaign:
-    """What the encoders of a platform read of some mechanics, on clocks of their own."""
+    """What the encoders of a platform read of some mechanics, on clocks of their own: with noise, or in steps."""
     # Behind what is left out there is room for clocks that are early or late.
     kept = (run.time >= SKIPPED) & (run.time < LENGTH - SKIPPED)
     time, table = run.time[kept], run.table[:, kept]
     angles = CubicSpline(run.time, run.angles, axis=1)(time + design.offset)
     readings = np.concatenate([table, platform._read(angles, design.harmonics)], axis=2)
-    readings = readings + NOISE * np.random.default_rng(seed).standard_normal(readings.shape)
+    noise = NOISE * np.random.default_rng(seed).standard_normal(readings.shape)
+    readings = platform._quantised(readings, design.quantum) if design.quantum else readings + noise
     runs = [np.column_stack([time + k * (LENGTH + PAUSE), np.full(len(time), k + 1.0), np.rad2deg(r)])
             for k, r in enumerate(readings)]  # fmt: skip
     names = ["time", "segment", "table_x", "table_y", "table_z", *GIMBALS]
