@@ -7,6 +7,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.signal import cont2discrete, lfilter
 
 import gyromodel
 from gyromodel.campaign import Campaign
@@ -259,3 +260,21 @@ def test_a_plan_of_positions_tells_what_it_shows(tmp_path):
     assert {"bias_acceleration_spin", "bias_acceleration_squared"} <= set(found.detectable)
     assert found.not_testable["bias_acceleration_output"] == "needs a column acceleration_output"
     assert not any("acceleration" in sentence for sentence, _ in found.tests)
+
+
+def test_a_response_of_second_order_has_no_name() -> None:
+    """A loop that rings at 12 Hz, which no delay or lag of first order is."""
+    rng, fine, rows = np.random.default_rng(1), 10, 800
+    step, ringing, damping = 0.01 / fine, 2 * np.pi * 12, 0.35
+    time = np.arange((rows + 200) * fine) * step
+    tones = np.geomspace(0.2, 3.0, 6)
+    rate = sum(rng.uniform(5, 25) * np.sin(2 * np.pi * f * time + rng.uniform(0, 6)) for f in tones)
+    loop = cont2discrete(([ringing**2], [1, 2 * damping * ringing, ringing**2]), step, method="bilinear")
+    kept = slice(200 * fine, None, fine)
+    output = lfilter(loop[0].ravel(), loop[1], rate)[kept] + 0.4 + 0.03 * rng.standard_normal(rows)
+    columns = {"time": 0.01 * np.arange(rows), "rate": rate[kept], "output": output}
+    campaign = Campaign(columns, {"time": "s", "rate": "deg/s", "output": "deg/s"}, {"kind": "rate"})
+    found = gyromodel.diagnose(campaign, model_from_effects(["scale_factor", "bias"]), hold_out=False)
+    assert found.verdict == "unknown"
+    assert found.driver
+    assert found.driver.column == "d(rate)/dt"

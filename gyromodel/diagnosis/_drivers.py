@@ -23,6 +23,9 @@ CROWDED = 0.1
 # A column has a past worth looking at if its steps from row to row are this small beside its own variation; how long
 # before, as parts of a run.
 SLOW, LAGS = 0.05, (0.01, 0.03, 0.08)
+# Samples before and after, whose rates stand for a linear response of any form (those after for its smooth part at the
+# ends of a run), and the least part of steps at which rates move.
+RESPONSE, MOVING = (13, 5, 2, 1, -1, -2), 0.5
 # What `compensate` adds is the output itself; every function of the ramp's code is bias_readout_code.
 NOT_DRIVERS = ("time", "output", "segment", "run", "position", "feedback_ramp", "rate_estimated", "rate_estimated_std")
 
@@ -53,6 +56,8 @@ def smooths(record: Record) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
         yield from _of_one(record, f"smooth({name})", np.asarray(record.signals[name]))
     if "rate" in names and (places := _places(record)) is not None:
         yield "smooth(rate)", np.asarray(record.signals["rate"]), _bumps(record, places, SMOOTH_SCALES[0])
+    if record.domain == "gyro" and "rate" in names:
+        yield from _response(record)
     for name in (n for n in names if n not in ("rate", "campaign") and _slow(record, n)):
         if is_angle(record.units[name]):
             continue  # it may wrap round, which is no rate of change
@@ -127,6 +132,29 @@ def _slow(record: Record, name: str) -> bool:
     values = np.asarray(record.signals[name])[: record.rows]
     steps = np.concatenate([np.diff(values[rows]) for rows in _runs(record)])
     return bool(np.mean(steps**2) < SLOW * np.var(values))
+
+
+def _response(record: Record) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Any linear response to a moving rate: its values some samples before and after, over its rate of change."""
+    rate, time = (np.asarray(record.signals[n])[: record.rows] for n in ("rate", "time"))
+    most = max(RESPONSE)
+    runs = [rows for rows in _runs(record) if len(rows) > most]
+    if not runs:
+        return
+    if np.mean(np.concatenate([np.diff(rate[rows]) != 0 for rows in runs])) < MOVING:
+        return
+    before = np.zeros((len(record.signals["time"]), len(RESPONSE)))
+    along = np.zeros(len(before))
+    for rows in runs:
+        along[rows] = np.gradient(rate[rows], time[rows])
+        # Beyond its ends a run goes on as it came.
+        t, r = (np.pad(v[rows], most, mode="reflect", reflect_type="odd") for v in (time, rate))
+        for i, k in enumerate(RESPONSE):
+            before[rows, i] = np.interp(time[rows] - k * record.interval, t, r)
+    # Of columns so much alike only what is left of each beside those before can be weighed.
+    inside = np.column_stack([np.ones(record.rows), rate, before[: record.rows]])
+    before[: record.rows] = np.linalg.qr(inside)[0][:, 2:]
+    yield f"smooth({RATE_OF.format('rate')})", along, before
 
 
 def _history(record: Record, name: str) -> Iterator[tuple[str, np.ndarray]]:

@@ -8,10 +8,18 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gyromodel.diagnosis._drivers import smooth_columns
-from gyromodel.diagnosis._evidence import log_sum
+from gyromodel.diagnosis._evidence import log_evidence_ratio, log_sum
 from gyromodel.diagnosis._forms import MAXIMUM_LINES, addition
 from gyromodel.diagnosis._pairs import best_pair
-from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise, line_frequencies, rank_where_it_matters
+from gyromodel.diagnosis._ranking import (
+    Ranking,
+    is_driver,
+    is_noise,
+    line_frequencies,
+    rank,
+    rank_where_it_matters,
+    skipped,
+)
 from gyromodel.diagnosis._scan import CLEARLY, Scanner
 from gyromodel.effects import Effect
 from gyromodel.estimate import Estimate, EstimateError, fit_record
@@ -132,7 +140,7 @@ def search(
             ranking = rank_where_it_matters(scanner, after, step.rows)
             break
     driver, score = path[0].ranking.best(drivers=True) if path else (None, -np.inf)
-    if score > max(sum(f.ranking.statistic[f.name] for f in path) + EXCHANGE, threshold):
+    if score > threshold and _lead(scanner, baseline, str(driver), path, ranking) > EXCHANGE:
         # One smooth driver explains more than all the names together; names of its own columns may have had to stand
         # back behind one that follows several of them.
         own, first = set(smooth_columns(str(driver))), path[0].effect
@@ -162,7 +170,7 @@ def _unresolved(estimate: Estimate, step: Found, reading: float) -> str:
     the motion: it is not the noise that the evidence weighs. Nor is what another effect may leave.
     """
     model, record = estimate.model, estimate.record
-    if step.effect is None or step.effect.label not in model.labels:
+    if record.domain == "gyro" or step.effect is None or step.effect.label not in model.labels:
         return ""
     effect = model.effects[model.labels.index(step.effect.label)]
     size = float(np.abs(np.asarray(effect.contribution(record.signals))[: record.rows]).max())
@@ -177,6 +185,28 @@ def _unresolved(estimate: Estimate, step: Found, reading: float) -> str:
     else:
         return ""
     return f"{step.name} would be within {within} throughout, where {passes} for it: not named."
+
+
+def _lead(scanner: Scanner, baseline: Estimate, driver: str, path: list[Found], last: Ranking) -> float:
+    """By how many nats a driver of the first ranking leads all that was found together.
+
+    Names that partly stand for one another add up to more than they explain. Beside a driver that was ahead of the
+    first, several are therefore also weighed as one addition, by what they have explained in the last noise cells.
+    """
+    first, name = path[0].ranking, path[0].name
+    lead = first.statistic[driver] - sum(f.ranking.statistic[f.name] for f in path)
+    p, q = first.baseline_columns.shape[1], last.baseline_columns.shape[1]
+    several = len(standing(path)) > 1 and q > p and not any(f.frees_noise for f in path)
+    if lead > EXCHANGE or not several or first.statistic[driver] < first.statistic[name]:
+        return lead
+    first = rank(scanner, list(last.results), baseline, (), skipped(baseline.model, scanner.record.signals))
+    names, alone = [], []
+    for g, other in last.results.items():
+        one = first.results[g]
+        log, left = one.log_likelihood + first.log_prior[g], np.array(one.rss - other.rss)
+        names.append(log + log_evidence_ratio(left, one.rss, first.samples - p, q - p))
+        alone.append(log + one.evidence.get(driver, -np.inf))
+    return max(lead, log_sum(alone) - log_sum(names))
 
 
 def _added(

@@ -67,7 +67,8 @@ def levenberg_marquardt(
             converged = bool(damping < 1.0 or orthogonal or worse <= KINK_TOLERANCE * tolerance * cost)
             # The last step is as good as those before it, and known already.
             return Solution(x + step if converged else x, cost, iteration, converged)
-        a_new, g_new, cost_new = normal(x + step)
+        with np.errstate(over="ignore", invalid="ignore"):  # a step too far is refused below
+            a_new, g_new, cost_new = normal(x + step)
         if _finite(a_new, g_new, cost_new) and cost_new <= cost:
             decrease = cost - cost_new
             # Decrease over what the linear model promised: near one, the damping falls (Nielsen 1999, equation 2.4).
