@@ -150,6 +150,7 @@ def test_lots_are_of_a_size_in_memory():
     assert list(running._parted(many[:3], states, 1)) == [[e] for e in many[:3]]
 
 
+@pytest.mark.long
 def test_a_killed_run_goes_on_where_it_was(tmp_path: Path):
     archive(tmp_path, 40)
     whole = here(tmp_path, "whole.parquet").table
@@ -359,6 +360,7 @@ def test_a_run_that_ends_meanwhile_is_no_lock(tmp_path: Path, monkeypatch: pytes
         pass
 
 
+@pytest.mark.long
 def test_axes_and_diagnoses(tmp_path: Path):
     """Each axis has its rows, and a dead one its reason; with a diagnosis come verdict and gain."""
     (tmp_path / "archive").mkdir()

@@ -313,6 +313,7 @@ def miss(bias: jax.Array, turns: jax.Array, pushes: jax.Array) -> jax.Array:
     return jnp.sum(last.velocity) + 1e6 * jnp.sum(last.position[:2]) + jnp.sum(last.attitude)
 
 
+@pytest.mark.long
 def test_gradient_of_navigation_and_its_memory():
     """Reverse mode equals finite differences; it keeps less than the states of all steps."""
     turns, pushes = (1e-3 * jnp.asarray(x) for x in motion(np.arange(STEPS) * 1e-3))

@@ -39,6 +39,7 @@ def white(rng: np.random.Generator) -> np.ndarray:
     return truth.white(ROWS, STEP, WHITE, rng)
 
 
+@pytest.mark.long
 def test_quantisation_of_the_angle_has_its_size(rng: np.random.Generator):
     """An angle counted in whole steps: its rounding errors have a variance of a twelfth of a step squared."""
     step = 2.5 * WHITE * np.sqrt(STEP)
@@ -50,6 +51,7 @@ def test_quantisation_of_the_angle_has_its_size(rng: np.random.Generator):
     assert binom.cdf(inside, len(sizes), 0.93) > RARE
 
 
+@pytest.mark.long
 def test_hops_between_two_levels_have_their_size_and_times(rng: np.random.Generator):
     size, times = 3.0 * WHITE / np.sqrt(STEP), (1600.0, 1000.0)
     hits, found = [], 0

@@ -75,6 +75,7 @@ def test_axes_as_they_should_be_say_so(rng: np.random.Generator):
     assert binom.sf(sum(claimed) - 1, 16, 1e-3) > 1e-4
 
 
+@pytest.mark.long
 def test_diagnose_takes_all_axes_of_a_campaign(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """One example, of a fixed seed."""
     rng = np.random.default_rng(1)
