@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gyromodel.declarations import RATE_OF
 from gyromodel.report import _drawing as draw
 from gyromodel.report._numbers import number, percent, unit_text
 from gyromodel.report._series import (
@@ -200,11 +201,17 @@ def _found(diagnosis: Diagnosis, known: dict[str, Abscissa]) -> Drawn:
     x, y, std = driver.x[order], driver.y[order], driver.std[order]
     power = draw.power_of_ten(float(np.nanmax(np.abs(y) + 2.0 * std)))
     scale = 10.0**power
-    for width, alpha in ((2.0, 0.16), (1.0, 0.26)):
-        lower, upper = (y - width * std) / scale, (y + width * std) / scale
-        axes.fill_between(x, lower, upper, color=draw.AFTER, alpha=alpha, linewidth=0.0, zorder=2)
-    axes.plot(x, y / scale, color=draw.AFTER, linewidth=2.0, zorder=5, label="function found")
-    caption = "Line: the function found; bands: one and two standard errors."
+    first, *more = driver.column.split(" and ")
+    # A response depends on what the rate was before and after as well.
+    if more or first == RATE_OF.format("rate"):
+        axes.plot(x, y / scale, ".", color=draw.AFTER, markersize=4.0, zorder=5, label="function found")
+        caption = f"Points: the function found, which depends on more than {driver_name(first)}, where it was measured."
+    else:
+        for width, alpha in ((2.0, 0.16), (1.0, 0.26)):
+            lower, upper = (y - width * std) / scale, (y + width * std) / scale
+            axes.fill_between(x, lower, upper, color=draw.AFTER, alpha=alpha, linewidth=0.0, zorder=2)
+        axes.plot(x, y / scale, color=draw.AFTER, linewidth=2.0, zorder=5, label="function found")
+        caption = "Line: the function found; bands: one and two standard errors."
     at = _column(diagnosis, known)
     if at is not None:
         means = bins(at, diagnosis.residual_before * _factor(diagnosis.rate_unit, driver.y_unit), apart(diagnosis))
@@ -223,7 +230,7 @@ def _found(diagnosis: Diagnosis, known: dict[str, Abscissa]) -> Drawn:
             )
             caption += " Squares: means of the residual before, moved to the level of the curve."
     label = driver_name(driver.column)
-    axes.set_xlabel(draw.axis_label(label, driver.unit, 0))
+    axes.set_xlabel(draw.axis_label(driver_name(first), driver.unit, 0))
     axes.set_ylabel(draw.axis_label("error of the simulation", driver.y_unit, power))
     draw.legend(axes, 2)
     reach = f"{number(float(np.nanmin(y)))} to {number(float(np.nanmax(y)))} {unit_text(driver.y_unit)}"

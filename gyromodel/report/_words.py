@@ -93,6 +93,8 @@ def driver_name(text: str) -> str:
 
 def _driven(column: str) -> str:
     base, form = measured(column)
+    if (base, form) == ("rate", RATE_OF):
+        return "angular acceleration"
     after = {RATE_OF: " rate", EARLIER: " some time before"}.get(form, "")
     return _DRIVERS.get(base, spoken(base)) + after
 
