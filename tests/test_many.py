@@ -74,8 +74,11 @@ def again(record: Record, rng: np.random.Generator) -> Record:
     return record._replace(signals={**record.signals, "output": jnp.asarray(output)})
 
 
-def test_values_are_those_of_single_fits_at_every_length(rng: np.random.Generator):
+def test_values_are_those_of_single_fits_at_every_length(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """One block and two, one sample less and more than full ones, with samples missing."""
+    monkeypatch.setattr(_fit, "TOLERANCE", 1e-14)  # single fits may end some 1e-3 standard deviations away
     records = [campaign(rng, rows, rows // 9) for rows in (250, 511, 512, 513, 700, 1024)]
     fits = fit_many(iter(records), thermal_model(), threads=2)
     assert fits.converged.all()

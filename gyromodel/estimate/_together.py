@@ -20,7 +20,7 @@ from gyromodel.signals import Record
 # Campaigns handed to the compiled program in one call.
 TOGETHER = 16
 # Distance from the minimum, in standard deviations of the parameters, at which a search ends with one more step.
-PRECISION = 1e-4
+PRECISION = 1e-5
 
 
 class Waiting(NamedTuple):
