@@ -250,10 +250,10 @@ def test_white_noise_shows_no_other(rng: np.random.Generator):
 
 @pytest.mark.parametrize(("kind", "other"), [("flicker", "noise_random_walk"), ("random_walk", "noise_flicker")])
 def test_strong_noise_is_told_by_its_colour(kind: str, other: str, rng: np.random.Generator):
-    """One hundred times the white variance at the record's length."""
+    """One hundred times the white variance at the record's length: of 200 draws 90 % (flicker) and 97 % (walk) are."""
     record, model = with_rows(ROWS), model_from_effects(["bias"])
-    N, share = 1e-6, []
-    for _ in range(8):
+    N, told = 1e-6, []
+    for _ in range(SEEDS):
         coloured = truth.flicker(ROWS, STEP, 2 * N / np.sqrt(STEP), rng)
         if kind == "random_walk":
             coloured = truth.random_walk(ROWS, STEP, 0.5 * N / STEP, rng)
@@ -262,5 +262,5 @@ def test_strong_noise_is_told_by_its_colour(kind: str, other: str, rng: np.rando
             "noise_flicker": 0.664 * float(estimate.model.noise["noise_flicker"]),
             "noise_random_walk": float(estimate.model.noise["noise_random_walk"]) * np.sqrt(ROWS * STEP / 4 / 3),
         }
-        share.append(at_length[f"noise_{kind}"] / (at_length[other] + at_length[f"noise_{kind}"]))
-    assert np.median(share) > 0.5, share
+        told.append(at_length[f"noise_{kind}"] > at_length[other])
+    assert binom.cdf(sum(told), SEEDS, 0.85) > RARE, sum(told)
