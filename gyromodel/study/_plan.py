@@ -42,7 +42,7 @@ SINGULAR = 1e-12
 
 
 class Part(NamedTuple):
-    """A candidate part of a test plan: what it is called, how long it takes (s), changeover included, and its course."""
+    """A candidate part of a test plan: what it is called, how long it takes (s) with its changeover, and its course."""
 
     name: str
     duration: float
