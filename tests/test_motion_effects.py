@@ -262,6 +262,7 @@ def test_a_plan_of_positions_tells_what_it_shows(tmp_path):
     assert not any("acceleration" in sentence for sentence, _ in found.tests)
 
 
+@pytest.mark.long
 def test_a_response_of_second_order_has_no_name() -> None:
     """A loop that rings at 12 Hz, which no delay or lag of first order is."""
     rng, fine, rows = np.random.default_rng(1), 10, 800
