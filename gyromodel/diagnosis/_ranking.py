@@ -30,7 +30,7 @@ ALIKE = 0.2
 
 @dataclass(frozen=True)
 class Ranking:
-    """Evidence of every candidate summed over noise cells, against nothing added."""
+    """Evidence of every candidate summed over noise cells, against nothing added; of those `fitted` by their fits."""
 
     statistic: dict[str, float]
     posterior: dict[str, float]
@@ -42,6 +42,7 @@ class Ranking:
     residual: np.ndarray = field(repr=False)
     samples: int
     tangents: dict[str, Tangent] = field(default_factory=dict, repr=False)
+    fitted: frozenset[str] = frozenset()
 
     def best(self, *, drivers: bool, but: tuple[str, ...] = ()) -> tuple[str | None, float]:
         """The best unknown driver, or the best named candidate (but some), and its evidence ratio (ln)."""
@@ -78,7 +79,7 @@ class Ranking:
 
         Their signals hold the candidate's: no size of it would tell them apart on this campaign. A form
         that contains another which was searched is no twin: it follows whatever that one leaves. Nor is a step one of
-        a bias, which it becomes at an end of the record.
+        a bias, which it becomes at an end of the record, nor what fits have told apart.
         """
         result = self.results[self.best_cell(name)]
         _, explained, q = result.best[name]
@@ -87,7 +88,7 @@ class Ranking:
             k
             for k, (_, t, width) in result.best.items()
             if k not in (name, "outliers", "bias_step" if name == "bias" else "")
-            and k in self.statistic and not is_driver(k)
+            and k in self.statistic and not is_driver(k) and not {k, name} <= self.fitted
             and width <= q + 1 and t >= least
             and not result.best.keys() & set(effect_class(k).supersedes) - {k}
         }  # fmt: skip
