@@ -13,7 +13,7 @@ from gyromodel.diagnosis._exchange import SLOW_IN_TIME, SLOW_LEAD, exchanged, un
 from gyromodel.diagnosis._forms import MAXIMUM_LINES
 from gyromodel.diagnosis._pairs import best_pair
 from gyromodel.diagnosis._ranking import Ranking, line_frequencies, rank, skipped
-from gyromodel.diagnosis._steps import EXCHANGE, Found, Steps, standing
+from gyromodel.diagnosis._steps import EXCHANGE, Found, Steps, rows_of, standing
 from gyromodel.estimate import Estimate
 
 Progress = Callable[[str, float], None] | None
@@ -123,19 +123,25 @@ def _lead(steps: Steps, driver: str, path: list[Found], last: Ranking) -> float:
     """
     first, name = path[0].ranking, path[0].name
     lead = first.statistic[driver] - sum(f.ranking.statistic[f.name] for f in path)
-    p, q = first.baseline_columns.shape[1], last.baseline_columns.shape[1]
-    several = len(standing(path)) > 1 and q > p and not any(f.frees_noise for f in path)
-    if lead > EXCHANGE or not several or first.statistic[driver] < first.statistic[name]:
+    if first.statistic[driver] < first.statistic[name] or any(f.frees_noise for f in path):
+        return lead
+    # On the same data: a driver may follow what a name does not know of.
+    unknown = rows_of([f for f in path if not f.points])
+    if not unknown and (lead > EXCHANGE or len(standing(path)) < 2):
         return lead
     scanner, baseline = steps.scanner, steps.baseline
-    first = rank(scanner, list(last.results), baseline, (), skipped(baseline.model, scanner.record.signals))
+    first = rank(scanner, list(last.results), baseline, unknown, skipped(baseline.model, scanner.record.signals))
+    p, q = first.baseline_columns.shape[1], last.baseline_columns.shape[1]
+    if q <= p:
+        return lead
     names, alone = [], []
     for g, other in last.results.items():
         one = first.results[g]
         log, left = one.log_likelihood + first.log_prior[g], np.array(one.rss - other.rss)
         names.append(log + log_evidence_ratio(left, one.rss, first.samples - p, q - p))
         alone.append(log + one.evidence.get(driver, -np.inf))
-    return max(lead, log_sum(alone) - log_sum(names))
+    together = log_sum(alone) - log_sum(names)
+    return together if unknown else max(lead, together)
 
 
 def _together(steps: Steps, path: list[Found], estimate: Estimate, ranking: Ranking) -> list[tuple[Found, Estimate]]:

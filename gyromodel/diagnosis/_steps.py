@@ -71,7 +71,7 @@ class Steps:
         for step in found:
             if step.effect is not None:
                 model = model.with_effect(step.effect)
-        rows = _rows(found)
+        rows = rows_of(found)
         data = self.scanner.record.without(np.array(rows)) if rows else self.scanner.record
         model = replace(model, noise=self.baseline.model.noise if given else {})
         for attempt in (model, _shapes_held(model, found)):
@@ -95,7 +95,7 @@ class Steps:
 
         A shape between those searched loses a part of what it explains: of much evidence, more than a rival's lead.
         """
-        ranking = rank_where_it_matters(self.scanner, estimate, _rows(found))
+        ranking = rank_where_it_matters(self.scanner, estimate, rows_of(found))
         (name, score), driver = ranking.best(drivers=False), ranking.best(drivers=True)[1]
         near = {k for k, v in ranking.statistic.items() if v >= (1.0 - BETWEEN) * score and self._has_shape(k)}
         if BETWEEN * score < EXCHANGE or not name or not self.scanner.bank.forms(name):
@@ -104,7 +104,7 @@ class Steps:
             return ranking
         each = [self.step(found, estimate, ranking, k) for k in {name, *near}]
         # Fits compare on the same data.
-        given_up = Found("", None, _rows(each), ranking)
+        given_up = Found("", None, rows_of(each), ranking)
         fits = {step.name: self.fit(standing([*found, step, given_up])) for step in each}
         quality = {k: _quality(fit) for k, fit in fits.items() if fit is not None}
         before = self.fit([*found, given_up])
@@ -123,7 +123,7 @@ class Steps:
 
     def step(self, found: Sequence[Found], estimate: Estimate, ranking: Ranking, name: str) -> Found:
         """A candidate of a ranking beside what was found, as one more step."""
-        return Found(name, *addition(self.scanner, estimate, ranking, name, _rows(found)), ranking)
+        return Found(name, *addition(self.scanner, estimate, ranking, name, rows_of(found)), ranking)
 
     def all_but(self, found: Sequence[Found], i: int) -> tuple[Estimate, Ranking] | None:
         """The fit with everything found except item i, and all candidates beside it; none where that fit fails."""
@@ -150,7 +150,8 @@ def _quality(estimate: Estimate) -> float:
     return estimate.log_likelihood - 0.5 * (volume + p * np.log(estimate.degrees_of_freedom + p))
 
 
-def _rows(found: Sequence[Found]) -> tuple[int, ...]:
+def rows_of(found: Sequence[Found]) -> tuple[int, ...]:
+    """The rows given up with some steps."""
     return tuple(sorted({r for f in found for r in f.rows}))
 
 
