@@ -64,7 +64,9 @@ def _chosen_again(
         if len(standing(changed)) < len(changed):
             continue
         after = steps.fit(changed)
-        if after is not None and not unresolved(after, step, steps.scanner.step):
+        if after is None or not steps.fits_better(changed, found):
+            continue
+        if not unresolved(after, step, steps.scanner.step):
             found, estimate, rankings = changed, after, {i: ranking}
     return found, estimate, rankings
 

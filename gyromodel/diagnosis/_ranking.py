@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gyromodel._checks import thermometers
+from gyromodel.diagnosis._drivers import RESPONSE_DRIVER
 from gyromodel.diagnosis._evidence import log_sum
 from gyromodel.diagnosis._scan import CellResult, Scanner
 from gyromodel.diagnosis._tangents import Tangent
@@ -45,7 +46,12 @@ class Ranking:
     fitted: frozenset[str] = frozenset()
 
     def best(self, *, drivers: bool, but: tuple[str, ...] = ()) -> tuple[str | None, float]:
-        """The best unknown driver, or the best named candidate (but some), and its evidence ratio (ln)."""
+        """The best unknown driver, or the best named candidate (but some), and its evidence ratio (ln).
+
+        Lines that any response to the motion explains better are the motion's own.
+        """
+        if self.statistic.get(RESPONSE_DRIVER, -np.inf) > self.statistic.get("bias_periodic", -np.inf):
+            but = (*but, "bias_periodic")
         mine = {k: v for k, v in self.statistic.items() if is_driver(k) == drivers and k not in but}
         # Of names that are the same on this campaign the first, whatever the rounding.
         top = max(mine, key=lambda k: round(mine[k], 6)) if mine else None
@@ -79,8 +85,10 @@ class Ranking:
 
         Their signals hold the candidate's: no size of it would tell them apart on this campaign. A form
         that contains another which was searched is no twin: it follows whatever that one leaves. Nor is a step one of
-        a bias, which it becomes at an end of the record, nor what fits have told apart.
+        a bias, which it becomes at an end of the record; fits tell what the shapes searched cannot.
         """
+        if name in self.fitted:
+            return set()
         result = self.results[self.best_cell(name)]
         _, explained, q = result.best[name]
         least = explained - ALIKE * (result.rss - explained) / self.samples
@@ -88,7 +96,7 @@ class Ranking:
             k
             for k, (_, t, width) in result.best.items()
             if k not in (name, "outliers", "bias_step" if name == "bias" else "")
-            and k in self.statistic and not is_driver(k) and not {k, name} <= self.fitted
+            and k in self.statistic and not is_driver(k)
             and width <= q + 1 and t >= least
             and not result.best.keys() & set(effect_class(k).supersedes) - {k}
         }  # fmt: skip

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gyromodel.diagnosis._drivers import RESPONSE_DRIVER, smooth_columns
+from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._evidence import log_evidence_ratio, log_sum
 from gyromodel.diagnosis._exchange import SLOW_IN_TIME, SLOW_LEAD, exchanged, unresolved
 from gyromodel.diagnosis._forms import MAXIMUM_LINES
@@ -61,9 +61,7 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
         full = len(line_frequencies(estimate.model)) >= MAXIMUM_LINES
         lines = ranking.statistic.get("bias_periodic", -np.inf)
         remains = "bias_periodic" if full and lines >= threshold else ""
-        # Lines that the motion explains better are its own.
-        barred = full or ranking.statistic.get(RESPONSE_DRIVER, -np.inf) > lines
-        name, score = ranking.best(drivers=False, but=("bias_periodic" if barred else "", "" if path else avoid))
+        name, score = ranking.best(drivers=False, but=("bias_periodic" if full else "", "" if path else avoid))
         if name is None or (score < threshold and not _slow_structure(ranking, name, score, threshold, scanner.runs)):
             both = _together(steps, path, estimate, ranking)
             if not both or len(path) + 2 > MAXIMUM_ROUNDS or any(unresolved(e, f, scanner.step) for f, e in both):

@@ -28,6 +28,8 @@ from gyromodel.units import factor
 CREDIBLE = 0.95
 # Where the noise has a random walk even with them, these have no edge that a walk could not make, whatever their lead.
 NO_EDGE = ("bias_drift", "bias_warmup")
+# Standard uncertainties from which on a parameter has a size.
+VAGUE = 2.0
 # Gross errors that are listed by row.
 ROWS_TOLD = 12
 # A driver that names leave with more than this share of the structure makes the discrepancy unknown.
@@ -141,6 +143,11 @@ def judge(
         turn = sum(f.name == name for f in found[i:])
         causes.append(_cause(scanner, extended, step, turn, ranking, members, statistic, trials, null_scores))
         sets.append(members)
+    # Of these only something in common has a size: which of them it is, this campaign cannot tell.
+    vague = [c.effect for c in causes if any(p.std for p in c.parameters) and not any(map(_sized, c.parameters))]
+    if len(vague) > 1:
+        shared = dict.fromkeys(vague, 1.0 / len(vague))
+        sets = [members | shared if c.effect in vague else members for c, members in zip(causes, sets, strict=True)]
     order = sorted(range(len(causes)), key=lambda i: -causes[i].statistic)
     causes, sets = [causes[i] for i in order], [sets[i] for i in order]
     if selection.remains:
@@ -178,6 +185,10 @@ def judge(
     firm = tuple(c for c in named if c.effect not in sets[0])
     test = _next_test(list(sets[0]), record, causes[0])
     return Judgement("ambiguous", (*doubtful, *firm), sets[0], None, test, unexplained, tuple(findings))
+
+
+def _sized(parameter: ParameterValue) -> bool:
+    return bool(0.0 < VAGUE * parameter.std < abs(parameter.value))
 
 
 def _places(rows: Sequence[int], searched: Sequence[tuple[Campaign, bool]]) -> str:

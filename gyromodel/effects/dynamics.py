@@ -141,10 +141,13 @@ def _interval(signals: Signals) -> float:
 
 def resolved(signals: Signals, name: str = "rate") -> bool:
     """Whether a rate changes from sample to sample in a way that tells what it does between them."""
-    change = np.diff(np.asarray(signals[name]))[np.diff(np.asarray(signals["time"])) > 0]
-    if not np.ptp(change) > 0:
+    step = np.diff(np.asarray(signals["time"]))
+    within = (step > 0) & (step <= GAP * _interval(signals))
+    change, pairs = np.diff(np.asarray(signals[name])), within[1:] & within[:-1]
+    one, next_one = change[:-1][pairs], change[1:][pairs]
+    if not len(one) or not (np.ptp(one) > 0 and np.ptp(next_one) > 0):
         return False
-    return bool(np.corrcoef(change[1:], change[:-1])[0, 1] > RESOLVED)
+    return bool(np.corrcoef(one, next_one)[0, 1] > RESOLVED)
 
 
 def _usual(time: Float[Array, " sample"]) -> Float[Array, ""]:
