@@ -16,6 +16,8 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = Path(__file__).parent / "results"
+# Measured data, which are no part of the project.
+DATA = Path(os.environ.get("GYROMODEL_DATA", ROOT.parent / "shared" / "data"))
 MIB = 2**20
 
 

@@ -8,7 +8,6 @@ writes benchmarks/results/attitude_real.md. The data are read from the folder th
 
 from __future__ import annotations
 
-import os
 import sys
 from itertools import pairwise
 from pathlib import Path
@@ -19,13 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import gyromodel
-from benchmarks._measure import ROOT, table, write_result
+from benchmarks._measure import DATA, table, write_result
 from gyromodel.attitude import COLUMNS, body_rates
 from gyromodel.estimate import fit_function
 from gyromodel.numerics.rotations import cross, exponential, inverse, logarithm, product
 from gyromodel.platform import integrals
 
-DATA = Path(os.environ.get("GYROMODEL_DATA", ROOT.parent / "shared" / "data"))
 # The file of each session, and for how long the unit lies still before it is moved (s).
 SESSIONS = {
     "01": ("01_undisturbed_slow_rotation_A", 30.0),

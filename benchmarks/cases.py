@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import re
 import subprocess
 import sys
@@ -22,13 +21,12 @@ from typing import Any
 import numpy as np
 
 import gyromodel
-from benchmarks._measure import ROOT, table, timed, write_result
+from benchmarks._measure import DATA, ROOT, table, timed, write_result
 from gyromodel.estimate import fit_record
 from gyromodel.model_files import read_model
 from gyromodel.poses import static_poses
 from gyromodel.signals import Record, read_signals
 
-DATA = Path(os.environ.get("GYROMODEL_DATA", ROOT.parent / "shared" / "data"))
 # Nominal, from the publication of the data: gyro 4770 count per rad/s, accelerometer 416 count per m/s².
 COUNTS = "4770 count*s/rad"
 GRAVITY = 416.0 * 9.81  # count

@@ -9,7 +9,6 @@ writes benchmarks/results/real_data.md and .png. The data are read from the fold
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -23,11 +22,11 @@ import numpy as np
 from scipy.optimize import fminbound
 
 import gyromodel
-from benchmarks._measure import RESULTS, ROOT, table, timed, write_result
+from benchmarks._measure import DATA, RESULTS, table, timed, write_result
 from gyromodel.estimate import Estimate, fit_record
 from gyromodel.signals import read_signals
 
-DATA = "fog_rate_temperature/campaign.csv.gz"
+MEASURED = DATA / "fog_rate_temperature/campaign.csv.gz"
 # What the authors' form leaves (rad/s, rms) on soaks left out; far from it, this benchmark is wrong.
 PUBLISHED, TOLERANCE = 8.6e-4, 0.03
 FREQUENCIES = np.geomspace(0.02, 3.0, 60)
@@ -138,11 +137,10 @@ def _ladder(diagnosis: gyromodel.Diagnosis) -> list[str]:
 def main(argv: list[str] | None = None) -> None:
     argv = sys.argv[1:] if argv is None else argv
     argparse.ArgumentParser(description="Diagnosis of measured data beside its authors' calibration.").parse_args(argv)
-    path = Path(os.environ.get("GYROMODEL_DATA", ROOT.parent / "shared" / "data")) / DATA
-    if not path.exists():
-        print(f"{DATA} not found; GYROMODEL_DATA names the folder of the measured data", file=sys.stderr)
+    if not MEASURED.exists():
+        print(f"{MEASURED} not found; GYROMODEL_DATA names the folder of the measured data", file=sys.stderr)
         return
-    points = _Table(gyromodel.read_campaign(path))
+    points = _Table(gyromodel.read_campaign(MEASURED))
     simulation = gyromodel.model_from_effects(["scale_factor", "bias"])
     diagnosis, spent = timed(lambda: gyromodel.diagnose(points.campaign, simulation))
     alike = diagnosis.extended.ordinary

@@ -9,6 +9,8 @@ from scipy.stats import binom
 
 from gyromodel.batch import Parameter, copies, pooled_table, unit_statistics
 
+RARE = 1e-5
+
 
 def drawn(
     rng: np.random.Generator, units: int, campaigns: int, between: float, within: float, shift: float = 0.0,
@@ -37,11 +39,6 @@ def statistics(table: pa.Table) -> Parameter:
     return found
 
 
-def within_binomial(count: int, total: int, level: float) -> bool:
-    """Whether a count is one that the level would give in 999 of 1000 cases, on either side."""
-    return bool(binom.ppf(5e-4, total, level) <= count <= binom.ppf(1 - 5e-4, total, level))
-
-
 @pytest.mark.parametrize(("units", "campaigns"), [(12, 1), (6, 4), (20, 3)])
 def test_intervals_cover_whatever_the_spreads_are(units: int, campaigns: int, seed: int):
     """One campaign of each archive, as those of one archive err together; a uniform prior errs on the wide side."""
@@ -56,9 +53,9 @@ def test_intervals_cover_whatever_the_spreads_are(units: int, campaigns: int, se
         covered += bool(found.pooled["low"][k] <= true[k] <= found.pooled["high"][k])
         spread += bool(found.between.low <= between <= found.between.high)
         closer.append(np.mean(found.pooled["std"] / std))
-    assert covered >= binom.ppf(1e-3, archives, 0.95), f"seed {seed}: {covered} of {archives}"
+    assert covered >= binom.ppf(RARE, archives, 0.95), f"seed {seed}: {covered} of {archives}"
     if (units, campaigns) != (12, 1):
-        assert spread >= binom.ppf(1e-3, archives, 0.93), f"seed {seed}: {spread} of {archives}"
+        assert spread >= binom.ppf(RARE, archives, 0.93), f"seed {seed}: {spread} of {archives}"
     assert np.mean(closer) < 0.9, "pooling helps nobody"
 
 
@@ -78,7 +75,7 @@ def test_nothing_stands_out_but_by_chance(seed: int):
     for _ in range(archives):
         found = statistics(drawn(rng, 8, 4, rng.choice([0.3, 3.0]), rng.choice([0.0, 1.0]))[0])
         alarms += [bool(found.outliers), bool(found.drifts)]
-    assert alarms.max() <= binom.ppf(0.999, archives, 0.01), f"seed {seed}: {alarms} of {archives}"
+    assert alarms.max() <= binom.isf(RARE, archives, 0.01), f"seed {seed}: {alarms} of {archives}"
 
 
 def test_a_unit_that_is_off_and_one_that_drifts_are_named(seed: int):
@@ -150,4 +147,4 @@ def test_two_units_are_enough(units: int, campaigns: int, seed: int):
         covered += bool(found.pooled["low"][k] <= true[found.pooled["row"]][k] <= found.pooled["high"][k])
         mean += abs(found.mean - 40) < 2 * found.mean_std
         assert not found.outliers
-    assert min(covered, mean) >= binom.ppf(1e-3, archives, 0.93), f"seed {seed}: {covered}, {mean} of {archives}"
+    assert min(covered, mean) >= binom.ppf(RARE, archives, 0.93), f"seed {seed}: {covered}, {mean} of {archives}"

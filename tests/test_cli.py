@@ -385,9 +385,19 @@ def test_export_refuses_a_model_without_values(bench: Path, run: Run):
     assert "no value" in refusal(run("export", bench / "simulation.yaml", "--to", "c"))
 
 
-def test_diagnose_writes_its_results(bench: Path, run: Run):
-    out = bench / "diagnosis"
-    done = run("diagnose", bench / "campaign.csv", "--model", bench / "simulation.yaml", "-o", out)
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """The demo's folder and what it printed as JSON, from another directory and another process."""
+    place = tmp_path_factory.mktemp("anywhere")
+    command = [sys.executable, "-m", "gyromodel", "demo", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=place)
+    assert done.returncode == 0, done.stderr
+    return place / "gyromodel-demo", json.loads(done.stdout)
+
+
+def test_diagnose_writes_its_results(demo: tuple[Path, dict[str, Any]], tmp_path: Path, run: Run):
+    folder, out = demo[0], tmp_path / "diagnosis"
+    done = run("diagnose", folder / "campaign.csv", "--model", folder / "simulation.yaml", "-o", out)
     assert done.status == 0, done.err
     said = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
     assert said["verdict"] in {"adequate", "named", "ambiguous", "unknown"}
@@ -444,16 +454,6 @@ def test_allan_refuses_what_has_no_noise(tmp_path: Path, run: Run):
     (tmp_path / "campaign.csv").write_text(axes, encoding="utf-8")
     assert "axis" in refusal(run("allan", tmp_path / "campaign.csv", "-o", tmp_path / "out"))
     assert "nothing.csv" in refusal(run("allan", tmp_path / "nothing.csv", "-o", tmp_path / "out"))
-
-
-@pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """The demo's folder and what it printed as JSON, from another directory and another process."""
-    place = tmp_path_factory.mktemp("anywhere")
-    command = [sys.executable, "-m", "gyromodel", "demo", "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=place)
-    assert done.returncode == 0, done.stderr
-    return place / "gyromodel-demo", json.loads(done.stdout)
 
 
 def test_demo_writes_its_results_beside_the_inputs(demo: tuple[Path, dict[str, Any]]):

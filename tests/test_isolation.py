@@ -17,7 +17,7 @@ from tests.truth import study
 
 N, STEP = 1e-3, 20.0  # deg/h/sqrt(Hz), s
 DEG_H = np.pi / 180 / 3600
-RARE = 1e-4
+RARE = 1e-5
 
 
 def log(temperature: np.ndarray, **columns: np.ndarray) -> Campaign:

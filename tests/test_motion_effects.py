@@ -321,6 +321,7 @@ def test_a_rate_is_followed_between_gaps() -> None:
     assert TimeDelay.candidates({"time": time, "rate": rate})
 
 
+@pytest.mark.long
 def test_a_response_of_second_order_has_no_name() -> None:
     """A loop that rings at 12 Hz, which no delay or lag of first order is."""
     ringing, damping = 2 * np.pi * 12, 0.35

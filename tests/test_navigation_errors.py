@@ -65,6 +65,7 @@ def test_a_bias_about_east_tilts_and_runs_north(gyros: list[Estimate]):
     assert np.asarray(made.position)[5:, 0] == pytest.approx(way[5:], rel=0.03)
 
 
+@pytest.mark.long
 def test_the_covariance_is_that_of_draws(gyros: list[Estimate]):
     """400 draws of all parameters, each run through the whole navigation."""
     found = navigation_error(gyros, [mission(35.0)] * 3, START, at_rest(), STEP, EVERY)

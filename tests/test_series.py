@@ -91,6 +91,7 @@ def drawn(clean: BaseMotion, rng: np.random.Generator) -> Draw:
     return Draw(noisy, runs, fit_series(noisy, runs, ALTERNATIVE), fitted)
 
 
+@pytest.mark.long
 def test_intervals_hold_and_both_fits_agree(clean: BaseMotion, rng: np.random.Generator):
     draws = [drawn(clean, rng) for _ in range(DRAWS)]
     # Draw by fit (of the series, of the responses) by entry.

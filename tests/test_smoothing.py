@@ -37,17 +37,23 @@ def error(found: np.ndarray, true: np.ndarray) -> float:
 @pytest.mark.parametrize("noise", [0.002, 0.05], ids=["staircase", "dithered"])
 @pytest.mark.parametrize("course", COURSES)
 def test_quantised_thermometers(course: str, noise: float, rng: np.random.Generator):
-    """Far better than differences, and near the filter of the best width, which nobody knows in life."""
+    """Far better than differences, and near the filter of the best width, which nobody knows in life.
+
+    One draw in two hundred is 1.5 times as far off as that filter; the geometric mean of eight is so in none of 10⁷.
+    """
     true = np.gradient(COURSES[course], STEP)
-    measured = np.round((COURSES[course] + noise * rng.standard_normal(ROWS)) / 0.0625) * 0.0625
-    ours = error(smooth_derivative(TIME, measured), true)
-    raw = error(np.gradient(measured, TIME), true)
-    widths = (11, 31, 101, 301, 901)
-    best = min(error(savgol_filter(measured, w, 3, deriv=1, delta=STEP), true) for w in widths)
-    assert ours < (0.25 if course == "cycling" else 0.04)
-    assert ours < raw / 3
+    far = []
+    for _ in range(8):
+        measured = np.round((COURSES[course] + noise * rng.standard_normal(ROWS)) / 0.0625) * 0.0625
+        ours = error(smooth_derivative(TIME, measured), true)
+        raw = error(np.gradient(measured, TIME), true)
+        widths = (11, 31, 101, 301, 901)
+        best = min(error(savgol_filter(measured, w, 3, deriv=1, delta=STEP), true) for w in widths)
+        assert ours < (0.25 if course == "cycling" else 0.04)
+        assert ours < raw / 3
+        far.append(np.log(ours / best))
     if course != "soak":  # which a cubic over a sixth of the record fits whole
-        assert ours < 1.5 * best
+        assert np.exp(np.mean(far)) < 1.3
 
 
 def test_cross_validation_is_not_caught_in_a_side_minimum(rng: np.random.Generator):

@@ -16,7 +16,7 @@ from tests.truth.effects import EFFECTS, UNKNOWN, coil_temperature_rate, draw_sh
 from tests.truth.mde import REGULAR, SCAN, amplitude, baseline, oracle, simpler, target
 from tests.truth.motion_designs import MOTION_DESIGNS
 
-RARE = 1e-5  # chance that a right simulator fails one statistical check
+RARE = 1e-6  # chance that a right simulator fails one of some hundred statistical checks
 
 
 def allan_variance(rate: np.ndarray, m: int) -> float:

@@ -6,18 +6,21 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.interpolate import make_interp_spline
 
 from gyromodel.estimate._estimate import Estimate, noise_coefficients
 from gyromodel.model import GyroModel, record_span
 from gyromodel.noise import NoiseRatios, markov_cells, noise_grid, restricted_likelihood
 from gyromodel.signals import Record
 
+Likelihood = Callable[[NoiseRatios], np.ndarray]
+
 # Factors (ln) on either side of the best noise ratios, tried one after the other: after the grid, and in later turns.
 COARSE_STEPS, FINE_STEPS = (0.8, 0.4, 0.2, 0.1), (0.7, 0.35, 0.17)
 # Noise is a Markov process rather than flicker and walk if it is so much likelier (nats).
 MARKOV_LEAD = 5.0
-# Levels of each noise ratio over its likely range, for the intervals of the noise coefficients.
-INTERVAL_LEVELS = 16
+# Levels of each noise ratio over its likely range, for the intervals of the noise coefficients, and between them.
+INTERVAL_LEVELS, FINER_LEVELS = 10, 41
 # Half the 95 % point of chi-squared with one degree of freedom.
 REJECTED = 1.92
 
@@ -37,36 +40,43 @@ def best_ratios(
         args = (record.interval, span, record.sampling, jacobian, residual)
         return restricted_likelihood(cells, *args).log_likelihood
 
-    best = start
+    best, top = start, None
     if coarse:
         grid = noise_grid(int(record.present.sum()), record.interval, span)
         # Every other level, then the levels around the best of them.
         levels = [np.unique(r) for r in grid.ratios]
-        first = _mesh(level[::2] for level in levels)
-        best = first.take(int(np.argmax(likelihood(first))))
-        near = _mesh(_around(level, float(r)) for level, r in zip(levels, best, strict=True))
-        best = near.take(int(np.argmax(likelihood(near))))
-    best, top = _refined(likelihood, best, COARSE_STEPS if coarse else FINE_STEPS)
+        best, _ = _likeliest(likelihood, _mesh(level[::2] for level in levels))
+        best, top = _likeliest(likelihood, _mesh(map(_around, levels, map(float, best))))
+    best, top = _refined(likelihood, best, top, COARSE_STEPS if coarse else FINE_STEPS)
     if not coarse or markov is False:
         return best
     cells = markov_cells(int(record.present.sum()), record.interval, span)
     if not len(cells.flicker):
         return best
-    other = cells.take(int(np.argmax(likelihood(cells))))
-    other, likeliest = _refined(likelihood, other, COARSE_STEPS)
+    other, likeliest = _refined(likelihood, *_likeliest(likelihood, cells), COARSE_STEPS)
     return other if markov or likeliest > top + MARKOV_LEAD else best
 
 
+def _likeliest(likelihood: Likelihood, cells: NoiseRatios) -> tuple[NoiseRatios, float]:
+    """The likeliest of some cells, and its log likelihood."""
+    each = likelihood(cells)
+    return cells.take(int(np.argmax(each))), float(each.max())
+
+
 def _refined(
-    likelihood: Callable[[NoiseRatios], np.ndarray], best: NoiseRatios, steps: Sequence[float]
+    likelihood: Likelihood, best: NoiseRatios, top: float | None, steps: Sequence[float]
 ) -> tuple[NoiseRatios, float]:
-    """The likeliest cell around one, and its log likelihood."""
-    top = -np.inf
+    """The likeliest cell around one, and its log likelihood; `top` is that of the one where it is known."""
     for width in steps:
         cells = _mesh(np.asarray(r) * np.exp(width * np.array([-1.0, 0.0, 1.0])) for r in best)
-        each = likelihood(cells)
-        best, top = cells.take(int(np.argmax(each))), float(each.max())
-    return best, top
+        if top is not None:
+            # The middle one is known.
+            cells = cells.take(np.delete(np.arange(len(cells.flicker)), len(cells.flicker) // 2))
+        if len(cells.flicker):
+            other, likelier = _likeliest(likelihood, cells)
+            if top is None or likelier > top:
+                best, top = other, likelier
+    return best, float(-np.inf if top is None else top)
 
 
 def _around(levels: np.ndarray, level: float) -> np.ndarray:
@@ -98,18 +108,20 @@ def with_noise_intervals(estimate: Estimate) -> Estimate:
     grid = noise_grid(samples, record.interval, span).ratios
     if float(estimate.ratios.markov) > 0:
         grid = markov_cells(samples, record.interval, span)
-    cells = _mesh(
-        np.union1d(r, float(b) * np.array([0.2, 1.0, 5.0])) for r, b in zip(grid, estimate.ratios, strict=True)
-    )
+    levels = [
+        np.union1d(np.unique(r)[::2], float(b) * np.array([0.2, 1.0, 5.0]))
+        for r, b in zip(grid, estimate.ratios, strict=True)
+    ]
     for margin in (4.0, 2.0, 2.0, 2.0, 0.0):
-        result = restricted_likelihood(cells, record.interval, span, record.sampling, jacobian, residual)
+        result = restricted_likelihood(_mesh(levels), record.interval, span, record.sampling, jacobian, residual)
         below = result.log_likelihood.max() - result.log_likelihood
-        kept = below < REJECTED
-        if not margin or kept.sum() > 2 * INTERVAL_LEVELS:
+        if not margin or np.sum(below < REJECTED) > 2 * INTERVAL_LEVELS:
             break
-        cells = _mesh(_levels(np.asarray(ratio), below < margin * REJECTED) for ratio in np.broadcast_arrays(*cells))
-    white = result.residual_sum[kept] / result.degrees_of_freedom
-    ratios = cells.take(kept)
+        levels = [_levels(r, below < margin * REJECTED) for r in _mesh(levels)]
+    finer, (log_likelihood, log_sum) = _finer(levels, result.log_likelihood, np.log(result.residual_sum))
+    kept = log_likelihood.max() - log_likelihood < REJECTED
+    white = np.exp(log_sum[kept]) / result.degrees_of_freedom
+    ratios = _mesh(finer).take(kept)
     spans = {k: (float(v.min()), float(v.max())) for k, v in noise_coefficients(ratios, white, record, gain).items()}
     low, high = spans["noise_white"]
     scatter = 1.96 / float(np.sqrt(2 * (record.present.sum() - 1)))
@@ -122,4 +134,17 @@ def _levels(ratio: np.ndarray, likely: np.ndarray) -> np.ndarray:
     levels = np.unique(ratio)
     first, last = np.searchsorted(levels, [ratio[likely].min(), ratio[likely].max()])
     low, high = levels[max(first - 1, 0)], levels[min(last + 1, len(levels) - 1)]
-    return np.linspace(np.sqrt(low), np.sqrt(high), INTERVAL_LEVELS) ** 2
+    return np.unique(np.linspace(np.sqrt(low), np.sqrt(high), INTERVAL_LEVELS) ** 2)
+
+
+def _finer(levels: Sequence[np.ndarray], *values: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Levels closer together in amplitude, where there are several, and what cubic splines make of values there."""
+    amplitudes = [np.sqrt(r) for r in levels]
+    closer = [np.linspace(a[0], a[-1], FINER_LEVELS if len(a) > 1 else 1) for a in amplitudes]
+    made = []
+    for value in values:
+        grid = value.reshape([len(a) for a in amplitudes])
+        for axis, (a, at) in enumerate(zip(amplitudes, closer, strict=True)):
+            grid = make_interp_spline(a, grid, k=min(3, len(a) - 1), axis=axis)(at)
+        made.append(grid.ravel())
+    return [a**2 for a in closer], made

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import combinations, cycle
@@ -27,6 +27,8 @@ from .verdicts import Answer, Score, judge
 Array = np.ndarray
 # The rival of these is the noise itself: they are judged with the ambiguous.
 SLOW = ("bias_drift", "bias_step", "bias_warmup")
+# The noise of a kind on a design.
+NoiseOf = Callable[[str, Design], Noise]
 CONTROLS = ("least_squares_f", "hac_f", "stepwise_bic", "lasso", "boosted_trees")
 
 
@@ -72,11 +74,11 @@ class Record:
     controls: dict[str, contest.Control]
 
 
-def build(case: Case) -> Built:
-    """Simulate a case."""
+def build(case: Case, noise_of: NoiseOf | None = None) -> Built:
+    """Simulate a case, its noise drawn by kind, or that of its design by `noise_of`."""
     rng = np.random.default_rng(case.seed)
     design = (DESIGNS | MOTION_DESIGNS)[case.design](rng)
-    noise = draw(case.noise, design, rng)
+    noise = noise_of(case.noise, design) if noise_of else draw(case.noise, design, rng)
     return Built(*hide(case.effect, design, noise, case.times_mde, rng), design, noise, case.seed)
 
 
@@ -144,9 +146,11 @@ def settled(built: Built, campaign: Any, model: Any, asked: str | None) -> tuple
     return tuple(gyromodel.diagnose([campaign, second], model, hold_out=False).credible_set)
 
 
-def run_case(case: Case, *, engine: bool = True, controls: Iterable[str] = (), **options: Any) -> Record:
+def run_case(
+    case: Case, *, engine: bool = True, controls: Iterable[str] = (), noise_of: NoiseOf | None = None, **options: Any
+) -> Record:
     """Simulate, diagnose and judge one case, also by some controls; `options` are those of `run_engine`."""
-    built = build(case)
+    built = build(case, noise_of)
     truth, design = built.truth, built.design
     size, isolable, first, others = 0.0, False, "", {}
     if controls or known(case.effect):
