@@ -284,7 +284,7 @@ def _said(record: study.Record) -> str:
 
 
 def _missed(records: list[study.Record]) -> list[str]:
-    """Every campaign at 3 x MDE or more, or with nothing hidden, whose answer was not right: enough to draw it again."""
+    """Every campaign at 3 x MDE or more, or with nothing hidden, that was not answered right, to draw it again."""
     wrong = [r for r in records if r.score and r.answer and not r.score.right]
     lines = [
         "## Answers that were not right",

@@ -131,8 +131,8 @@ def main(argv: list[str] | None = None) -> None:
             alone = [s.named for r, s in zip(records, scores, strict=True) if r.isolable]
             rows.append([f"{times:g}×, isolable: named, and nothing else", _share(alone)])
             rows.append([f"{times:g}×: firm and wrong", _share([s.firm_and_wrong for s in scores])])
-        for r in records:
-            if r.answer and r.score and (r.score.firm_and_wrong or (times is None and r.score.detected)):
+        for r, s in zip(records, scores, strict=True):
+            if r.answer and (s.firm_and_wrong or (times is None and s.detected)):
                 said = f"{r.answer.verdict}: {', '.join(r.answer.causes or r.answer.driver)}"
                 wrong.append([r.case.noise, r.case.design, str(r.case.effect), f"{times or 0:g}", said])
         print(*rows[-3:], sep="\n", flush=True)

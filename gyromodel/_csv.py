@@ -136,7 +136,7 @@ def _parse_block(block: bytes, names: list[str], first_row: int) -> list[np.ndar
 
 def _parse_lines(block: bytes, names: list[str], first_row: int) -> list[np.ndarray]:
     """The same as `_parse_block`, slowly, with the place of the first fault."""
-    lines = [line for line in re.split(rb"\r\n|\n|\r", block) if line]
+    lines = [line for line in re.split(rb"\r\n|\n|\r", block) if line.strip()]
     values = np.empty((len(names), len(lines)))
     for i, line in enumerate(lines):
         row = first_row + i

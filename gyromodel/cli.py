@@ -26,7 +26,6 @@ from gyromodel._console import (
 )
 from gyromodel._diagnose_files import REPORTS, diagnose_axes, diagnose_to
 
-DATA = Path(__file__).parent / "data"
 # Help without rich: it loads in half the time.
 app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -78,37 +77,9 @@ def _options(
 @app.command()
 def demo(as_json: AsJson = False) -> None:
     """Run the whole chain on embedded data; writes ./gyromodel-demo."""
-    from gyromodel.files import write_campaign
-    from gyromodel.model import simulate as simulate_campaign
-    from gyromodel.model_files import read_model
-    from gyromodel.plan import read_plan
+    from gyromodel._demo import run_demo
 
-    table, thermal = Path("gyromodel-demo"), Path("gyromodel-demo", "fiber_optic")
-    copies = {
-        "ring_laser_table.csv": table / "campaign.csv",
-        "ring_laser_model.yaml": table / "simulation.yaml",
-        "fiber_optic_plan.yaml": thermal / "plan.yaml",
-        "fiber_optic_truth.yaml": thermal / "truth.yaml",
-        "fiber_optic_model.yaml": thermal / "simulation.yaml",
-    }
-    for source, target in copies.items():
-        write_text(target, (DATA / source).read_text(encoding="utf-8"))
-    simulated = simulate_campaign(read_model(thermal / "truth.yaml"), read_plan(thermal / "plan.yaml"), seed=0)
-    write_campaign(simulated, thermal / "campaign.csv")
-    titles = {
-        table: "Ring laser gyro on a rate table, published data:",
-        thermal: "Fiber-optic gyro over temperature, simulated from truth.yaml:",
-    }
-    found = {}
-    for folder, title in titles.items():
-        diagnosis, verdict = diagnose_to(
-            read_campaigns([folder / "campaign.csv"], None), folder / "simulation.yaml", folder
-        )
-        found["ring_laser" if folder is table else "fiber_optic"] = diagnosis.to_dict() | {"model": "model.yaml"}
-        if not as_json:
-            print(f"{title}\n{verdict}")
-            print_paths(folder, *REPORTS)
-            print()
+    found = run_demo(quiet=as_json)
     if as_json:
         print(json_text(found), end="")
 
@@ -355,18 +326,9 @@ def batch(
     if output.suffix != ".parquet":
         raise typer.BadParameter("the table is a Parquet file: end its name in .parquet", param_hint="--output")
     refuse_overwriting(output, [model, Path(archive)])
-    from hashlib import sha256
+    from gyromodel._archive_files import batch_to
 
-    from gyromodel.batch import run_batch
-    from gyromodel.model_files import read_model
-
-    start, digest = read_model(model), sha256(model.read_bytes()).hexdigest()
-    output.parent.mkdir(parents=True, exist_ok=True)
-    with progress_bar() as progress:
-        done = run_batch(
-            archive, start, digest, output,
-            diagnosing=diagnose, workers=workers, scheduler=scheduler, progress=progress,
-        )  # fmt: skip
+    done = batch_to(archive, model, output, diagnose, workers, scheduler)
     result = {"results": str(output), "campaigns": done.campaigns, "examined": done.examined, "failed": done.failed}
     if as_json:
         print(json_text(result), end="")
@@ -389,29 +351,13 @@ def units(
     """Tell how the units of an archive spread, which stand out, and which drift."""
     if output:
         refuse_overwriting(output, [results])
-    from gyromodel.batch import copies, pooled_table, read_results, unit_statistics
-    from gyromodel.batch import write_table as write
+    from gyromodel._archive_files import print_units, units_of
 
-    table = read_results(results)
-    found = unit_statistics(table)
-    if twice := copies(table):
-        print(f"gyromodel: the same data as others, and counted once: {', '.join(twice)}", file=sys.stderr)
-    if output:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        write(pooled_table(table, found), output)
+    found = units_of(results, output)
     if as_json:
         print(json_text([statistics.to_dict() for statistics in found]), end="")
-        return
-    from gyromodel.report import with_uncertainty
-
-    rows = [
-        (f"{s.parameter}{' ' * bool(s.axis)}{s.axis}", str(s.units), str(s.campaigns),
-         with_uncertainty(s.mean, s.mean_std, s.unit), f"{s.between.value:.3g}", f"{s.within.value:.3g}")
-        for s in found
-    ]  # fmt: skip
-    print_table(("parameter", "units", "campaigns", "mean", "unit to unit", "campaign to campaign"), rows)
-    for line in (line for statistics in found for line in statistics.sentences()):
-        print(f"- {line}")
+    else:
+        print_units(found)
 
 
 @app.command()
@@ -501,36 +447,12 @@ def effects(
     as_json: AsJson = False,
 ) -> None:
     """Print the catalogue of effects, or one entry in full."""
-    from dataclasses import asdict
+    from gyromodel._catalogue_text import entries, print_catalogue, print_entry
 
-    from gyromodel.declarations import NOISE, declarations
-
-    catalogue = declarations()
-    if effect in NOISE:
-        kind = asdict(NOISE[str(effect)])
-        if as_json:
-            print(json_text(kind), end="")
-        else:
-            print("\n".join(f"{name.replace('_', ' '):<15}{value}" for name, value in kind.items()))
-        return
-    if effect is not None and effect not in catalogue:
-        from difflib import get_close_matches
-
-        close = get_close_matches(effect, [*catalogue, *NOISE], n=3)
-        hint = f"; did you mean {' or '.join(close)}?" if close else "; `gyromodel effects` lists them"
-        raise typer.BadParameter(f"no effect is called {effect}{hint}", param_hint="ID")
+    found = entries(effect)
     if as_json:
-        every = [*catalogue.values(), *NOISE.values()]
-        entries = asdict(catalogue[effect]) if effect else [asdict(entry) for entry in every]
-        print(json_text(entries), end="")
-    elif effect is None:
-        rows = [(e.id, e.site, ", ".join(e.needs) or "–", e.equation) for e in catalogue.values()]
-        rows += [(k.id, "noise", "–", k.meaning) for k in NOISE.values()]
-        print_table(("effect", "acts on", "needs", "equation"), rows)
+        print(json_text(found[0] if effect else found), end="")
+    elif effect:
+        print_entry(found[0])
     else:
-        entry = catalogue[effect]
-        needs = ", ".join(entry.needs) or "no column"
-        print("\n".join(filter(None, [entry.id, entry.equation, entry.details])))
-        print(f"\nacts on  {entry.site}\nneeds    {needs}\ncause    {entry.cause}\ntest     {entry.test}\n")
-        rows = [(p.name, f"{p.typical:g}", p.unit, p.meaning) for p in entry.parameters]
-        print_table(("parameter", "typical", "unit", "meaning"), rows)
+        print_catalogue(found)

@@ -78,15 +78,11 @@ def write_campaign(campaign: Campaign, path: str | os.PathLike[str]) -> None:
     """
     path = Path(path)
     try:
-        suffix = _suffix(path)
-        if path.is_dir() and not (suffix == ".zarr" and any((path / name).exists() for name in _ZARR_FILES)):
-            raise CampaignError("is a folder that holds something else than a campaign")
-        with replacing(Path(os.path.realpath(path))) as temporary:
-            _WRITERS[suffix](campaign, temporary)
+        writer = _WRITERS[_suffix(path)]
     except CampaignError as error:
         raise CampaignError(f"{path}: {error}") from error
-    except OSError as error:
-        raise CampaignError(f"{path}: cannot be written: {error.strerror or error}") from error
+    with replacing(path) as temporary:
+        writer(campaign, temporary)
 
 
 def is_zarr(path: Path) -> bool:
@@ -104,10 +100,17 @@ def _suffix(path: Path) -> str:
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A hidden sibling that takes the place of `path` at the end, or goes away after an error."""
+def replacing(target: Path) -> Iterator[Path]:
+    """A hidden sibling that takes the place of a campaign at the end, or goes away after an error.
+
+    Raises:
+        CampaignError: a folder of something else is there, or it cannot be written.
+    """
+    path = Path(os.path.realpath(target))
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
+        if path.is_dir() and not (_suffix(path) == ".zarr" and any((path / name).exists() for name in _ZARR_FILES)):
+            raise CampaignError(f"{target}: is a folder that holds something else than a campaign")
         yield temporary
         if path.is_dir():
             # A folder cannot be replaced in one step: the old one steps aside first.
@@ -121,6 +124,8 @@ def replacing(path: Path) -> Iterator[Path]:
             shutil.rmtree(aside)
         else:
             os.replace(temporary, path)
+    except OSError as error:
+        raise CampaignError(f"{target}: cannot be written: {error.strerror or error}") from error
     finally:
         if temporary.is_dir():
             shutil.rmtree(temporary)

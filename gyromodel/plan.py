@@ -73,7 +73,7 @@ def planned(plan: Mapping[str, Any], name: str) -> Campaign:
         raise CampaignError(f"duration / interval is over {_MOST_SAMPLES} samples; shorten it or sample more slowly")
     time = np.arange(max(round(duration / interval), 1)) * interval
     columns, units = {"time": time}, {"time": "s"}
-    for column, course in plan["columns"].items():
+    for column, course in ((str(key), value) for key, value in plan["columns"].items()):
         columns[column], units[column] = _course(f"column {column}", course, time)
     metadata = {str(key): value for key, value in plan.items() if key not in _KEYS | _APART}
     unit = str(plan["output"])
@@ -91,6 +91,8 @@ def _course(where: str, course: Any, time: np.ndarray) -> tuple[np.ndarray, str]
     # Segment ends are sums of floats: a sample within a billionth of the interval belongs to the segment that begins.
     clock = time + 1e-9 * (time[1] if len(time) > 1 else 1.0)
     for number, segment in enumerate(_segments(where, course), 1):
+        if start > clock[-1]:
+            break  # however often the rest is repeated
         spot = f"{where}, segment {number}"
         if not isinstance(segment, dict) or "for" not in segment or ("at" in segment) == ("to" in segment):
             raise CampaignError(f"{spot}: expected {{for: 1 h, at: 20 degC}} or {{for: 1 h, to: 60 degC}}")
@@ -119,7 +121,7 @@ def _segments(where: str, items: Any) -> Iterator[Any]:
     for item in items:
         if isinstance(item, dict) and "repeat" in item:
             times, inner = item["repeat"], item.get("segments")
-            if not isinstance(times, int) or times < 1 or not isinstance(inner, list):
+            if not isinstance(times, int) or times < 1 or not isinstance(inner, list) or not inner:
                 raise CampaignError(f"{where}: repeat needs a whole number above zero and a list of segments")
             for _ in range(times):
                 yield from _segments(where, inner)

@@ -9,12 +9,11 @@ from __future__ import annotations
 import gzip
 import hashlib
 import json
-import os
 import shutil
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, NamedTuple
@@ -54,11 +53,10 @@ class Streamed(NamedTuple):
 
 
 class _Scan(NamedTuple):
-    """What only the whole file tells: the first time, the median step (s), and the model as it is prepared."""
+    """What only the whole file tells: the first time and the median step (s)."""
 
     start: float
     interval: float
-    calibration: Calibration
 
 
 def compensate_file(
@@ -80,24 +78,24 @@ def compensate_file(
     Returns:
         None where only the whole campaign can be compensated: another kind of file, increments or angles, rates from an
         attitude, a clock without regular steps, a model that looks at other samples (lags, hysteresis, rates of
-        temperature), or a campaign with a fault, which `compensate` names.
+        temperature) or leaves open which columns it takes, or a campaign with a fault, which `compensate` names.
     """
     if not all(path.name.lower().endswith(SUFFIXES) for path in (source, target)):
         return None
     try:
         scan = _scanned(source, axis, calibration)
-    except (ValueError, OSError):
-        return None
+    except (ValueError, OSError, EOFError, zlib.error):
+        return None  # what reads the whole names the fault
     if scan is None:
         return None
     counts, rows, head = Counter[str](), 0, None
     with ExitStack() as open_ones:
-        temporary = open_ones.enter_context(replacing(Path(os.path.realpath(target))))
+        temporary = open_ones.enter_context(replacing(target))
         errors, text = (open_ones.enter_context(TemporaryFile(dir=target.parent)) for _ in range(2))
         body = open_ones.enter_context(_Body(target, temporary, text))
         spilled: list[Any] = []
         for part in _parts(source, axis):
-            done, more = apply_calibration(part, _read(part, scan), scan.calibration)
+            done, more = apply_calibration(part, _read(part, scan), calibration)
             counts.update(more)
             rows += len(done)
             head = done
@@ -108,7 +106,7 @@ def compensate_file(
                 errors.write(pair.T.tobytes())
             body.write(done)
         assert head is not None
-        head = head.with_metadata(told(scan.calibration, head, counts))
+        head = head.with_metadata(told(calibration, head, counts))
         judgement = _judgement(errors)
         if accept:
             accept(judgement)
@@ -194,12 +192,14 @@ def _begun(part: Campaign, needed: set[str], calibration: Calibration) -> _Scan 
         return None
     signals = read_signals(part).signals
     signals = signals | {"rate": jnp.zeros_like(signals["time"])}
-    model = calibration.model.prepared(signals)
+    model = calibration.model
+    if model.prepared(signals) is not model:
+        return None  # which columns it takes, or which runs, only the whole tells
     # A rate of temperature is that of a smooth curve through the whole record.
     lost = {f"{name}_rate": jnp.full_like(signals["time"], jnp.nan) for name in thermometers(part.columns)}
     if np.isnan(np.asarray(model.predict(signals | lost))).any():
         return None
-    return _Scan(float(part.si("time")[0]), np.nan, replace(calibration, model=model))
+    return _Scan(float(part.si("time")[0]), np.nan)
 
 
 def _median(steps: Counter[float]) -> float:

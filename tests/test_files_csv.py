@@ -33,6 +33,7 @@ def read_text(folder: Path, text: str | bytes, name: str = "a.csv") -> Campaign:
         "\ufeff" + LINES,
         LINES.rstrip("\n"),
         LINES + "\n\n",
+        LINES.replace("1,0.5", " \t\n1,0.5") + "  \n",
         LINES.replace("# kind: rate\n", "# a comment\n#kind:rate\n\n"),
         LINES.replace(",", " , "),
         LINES.replace("nan", "NA").replace(",,", ",null,"),

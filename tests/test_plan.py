@@ -45,6 +45,13 @@ def test_a_sample_at_a_segment_end_belongs_to_the_next_segment(tmp_path: Path):
     assert read_plan(tmp_path / "plan.yaml").columns["rate"].tolist() == list(range(30))
 
 
+def test_repeats_end_with_the_plan_and_names_may_be_numbers(tmp_path: Path):
+    course = "[{repeat: 1000000000, segments: [{for: 10 s, at: 1 deg/s}, {for: 10 s, at: 2 deg/s}]}]"
+    campaign = planned(tmp_path, f"  rate: {course}\n  1: 3 V\n")
+    assert campaign.columns["rate"].tolist() == [1, 2, 1, 2, 1, 2]
+    assert campaign.units["1"] == "V"
+
+
 @pytest.mark.parametrize(
     ("columns", "expected"),
     [
@@ -56,6 +63,7 @@ def test_a_sample_at_a_segment_end_belongs_to_the_next_segment(tmp_path: Path):
         ("  temperature: [{for: -3 s, at: 20 degC}]\n", "expected a time above zero"),
         ("  temperature: []\n", "no segments"),
         ("  temperature: [{repeat: 0, segments: []}]\n", "repeat needs a whole number"),
+        ("  temperature: [{repeat: 2, segments: []}]\n", "repeat needs a whole number"),
         ("  temperature: warm\n", "column temperature: 'warm' is no quantity"),
         ("  - rate\n", "columns must map"),
     ],

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from gyromodel import cli
+from gyromodel import CampaignError, cli
 from gyromodel.campaign import Campaign
 from gyromodel.effects.drivers import Bias
 from gyromodel.effects.scale import ScaleFactor, ScaleNonlinearity
@@ -34,6 +34,7 @@ from gyromodel.study import (
     covariance_after,
     information,
     known,
+    read_candidates,
     sensitivity,
     sobol_indices,
     symmetric_factor,
@@ -304,6 +305,26 @@ def test_rivals_are_told_apart_by_the_plan_that_parts_them_most(seed: int):
             change = misfit(wrong, y) - misfit(right, y)
             mean.append((change.mean(), change.std() / 20))
         assert min(m for m, _ in mean) == pytest.approx(plan.separation**2, abs=5 * max(e for _, e in mean))
+
+
+def test_a_changeover_takes_its_time_with_each_part(tmp_path: Path):
+    """Five parts of 2000 s fill 10 000 s; with 500 s between them, four do."""
+    path = tmp_path / "candidates.yaml"
+    calibration = known(thermal(COVARIANCE))
+    for text, most in (("", 5), ("changeover: 500 s\n", 4)):
+        path.write_text(text + CANDIDATES, encoding="utf-8")
+        choice = best_plan(calibration, read_candidates(path), 10_000.0)
+        assert [sum(plan.times.values()) for plan in (choice.best, choice.equal)] == [most, most]
+        assert choice.best.duration == 10_000.0
+        assert "changeover" not in read_candidates(path)[0].campaign.metadata
+    of_list = CANDIDATES.replace("{temperature: 60 degC}", "[temperature]")
+    for text, said in (
+        ("changeover: 500\n" + CANDIDATES, "changeover: expected a time above zero with its unit"),
+        (of_list, "candidate warm: columns must map"),
+    ):
+        path.write_text(text, encoding="utf-8")
+        with pytest.raises(CampaignError, match=said):
+            read_candidates(path)
 
 
 def test_plans_that_cannot_be_say_why():

@@ -101,11 +101,11 @@ def test_intervals_hold_and_both_fits_agree(clean: BaseMotion, rng: np.random.Ge
     for name, true in TRUE.items():
         value, std = (x[:, :, ENTRIES.index(name)] for x in (values, stds))
         errors = value[:, 0] - true
-        assert np.sum(np.abs(errors) < 1.96 * std[:, 0]) >= binom.ppf(1e-4, DRAWS, 0.95), (name, errors / std[:, 0])
+        assert np.sum(np.abs(errors) < 1.96 * std[:, 0]) >= binom.ppf(1e-5, DRAWS, 0.95), (name, errors / std[:, 0])
         # Wider than they need be, but not by far: each run tells its own noise.
         assert np.median(std[:, 0]) < 2.5 * np.std(errors), name
         assert (np.abs(value[:, 0] - value[:, 1]) < 4 * np.hypot(*std.T)).all(), name
     # Overtones tell dry friction from wet.
     dry = stds[:, :, ENTRIES.index("dry friction X")]
     assert np.median(dry[:, 0] / dry[:, 1]) < 0.95
-    assert sum(d.series.probability < 0.01 for d in draws) <= binom.ppf(1 - 1e-4, DRAWS, 0.02)
+    assert sum(d.series.probability < 0.01 for d in draws) <= binom.ppf(1 - 1e-5, DRAWS, 0.02)

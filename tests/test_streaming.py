@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 
 from gyromodel import _compensate_files, cli, streaming
+from gyromodel._checks import CampaignError
 from gyromodel.campaign import Campaign
 from gyromodel.compensation import compensate, reference_error
 from gyromodel.effects.drivers import Bias, BiasDrift
+from gyromodel.effects.geometry import TableTilt
 from gyromodel.effects.scale import ScaleFactor, ScaleNonlinearity
 from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureRate
 from gyromodel.estimate import Calibration
@@ -122,7 +124,10 @@ def test_an_axis_and_a_reference_are_those_of_the_whole(
     assert f"{whole.compensated:.4g}" in said[0][1]
 
 
-@pytest.mark.parametrize("what", ["memory", "increment", "missing", "irregular", "zarr", "constant", "lacking"])
+WHOLE = ["memory", "increment", "missing", "irregular", "zarr", "constant", "lacking", "open", "cut", "flipped"]
+
+
+@pytest.mark.parametrize("what", WHOLE)
 def test_what_needs_the_whole_is_left_to_it(
     what: str, tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ):
@@ -145,9 +150,29 @@ def test_what_needs_the_whole_is_left_to_it(
             measured = measured.with_column("output", np.full(ROWS, 1.0), "count/s")
         case "lacking":
             measured = measured.without("temperature")
+        case "open":  # its angle is the azimuth where that varies, which here is after the first part
+            calibration = Calibration(GyroModel((TableTilt(north=jnp.asarray(1e-6), east=jnp.asarray(0.0)),)))
+            measured = measured.with_column("table_angle", np.arange(ROWS), "deg")
+            measured = measured.with_column("azimuth", np.maximum(np.arange(ROWS) - 600, 0), "deg")
+        case "cut" | "flipped":
+            name = "log.csv.gz"
     write_campaign(measured, tmp_path / name)
+    if name == "log.csv.gz":
+        packed = bytearray((tmp_path / name).read_bytes())
+        packed[len(packed) // 2] ^= 0xFF * (what == "flipped")
+        (tmp_path / name).write_bytes(packed[: len(packed) // (1 + (what == "cut"))])
     assert streaming.compensate_file(tmp_path / name, tmp_path / "out.csv", calibration) is None
     assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_a_folder_is_not_replaced(kind: str, tmp_path: Path, rng: np.random.Generator):
+    write_campaign(campaign(rng), tmp_path / "log.csv")
+    (tmp_path / f"other.{kind}").mkdir()
+    (tmp_path / f"other.{kind}" / "part.0").write_text("precious")
+    with pytest.raises(CampaignError, match="is a folder that holds something else"):
+        streaming.compensate_file(tmp_path / "log.csv", tmp_path / f"other.{kind}", CALIBRATION)
+    assert (tmp_path / f"other.{kind}" / "part.0").read_text() == "precious"
 
 
 MEMORY = """

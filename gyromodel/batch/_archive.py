@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 import os
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -56,7 +56,7 @@ def entries(archive: str, but: Path | None = None) -> list[Entry]:
     elif root.is_file():
         found = [Entry(root.name, str(root.resolve()))]
     else:
-        found = _each_once(Path(name) for name in glob.glob(archive, recursive=True))
+        found = _each_once(_matching(root))
         if not found and not glob.has_magic(archive):
             raise CampaignError(f"{archive}: there is no such folder or file")
     if but is not None:
@@ -83,16 +83,34 @@ def _each_once(paths: Iterable[Path]) -> list[Entry]:
     return sorted(Entry(name, real) for real, (_, _, name) in found.items())
 
 
-def _campaigns_below(root: Path) -> list[Path]:
-    found, top, seen = [], os.path.realpath(root), set[str]()
+def _matching(pattern: Path) -> list[Path]:
+    """What a pattern names: as `glob` does, which never ends where links below `**` lead round in circles."""
+    if "**" not in pattern.parts:
+        return [Path(name) for name in glob.glob(str(pattern))]
+    place = pattern.parts.index("**")
+    tops, rest = _matching(Path(*pattern.parts[:place])), pattern.parts[place + 1 :] or ("*",)
+    folders = [folder for top in tops for folder, _, _ in _walked(top)]
+    return [path for folder in folders for path in _matching(Path(glob.escape(folder), *rest))]
+
+
+def _walked(root: Path) -> Iterator[tuple[str, list[str], list[str]]]:
+    """As `os.walk` through links, but no hidden folders, and each link to what is not below anyway once."""
+    top, seen = os.path.realpath(root), set[str]()
     for folder, folders, names in os.walk(root, followlinks=True):
+        folders[:] = [name for name in sorted(folders) if not name.startswith(".")]
+        links = {name: os.path.realpath(path) for name in folders if (path := Path(folder, name)).is_symlink()}
+        folders[:] = [n for n in folders if n not in links or not (links[n] in seen or _nested(top, links[n]))]
+        seen |= {*links.values()}
+        yield folder, folders, names
+
+
+def _campaigns_below(root: Path) -> list[Path]:
+    found = []
+    for folder, folders, names in _walked(root):
         here = Path(folder)
         groups = [name for name in folders if is_zarr(here / name)]
         found += [path for name in groups for path in _groups_below(here / name)]
-        folders[:] = [name for name in sorted(folders) if not name.startswith(".") and name not in groups]
-        links = {name: os.path.realpath(here / name) for name in folders if (here / name).is_symlink()}
-        folders[:] = [n for n in folders if n not in links or not (links[n] in seen or _nested(top, links[n]))]
-        seen |= {*links.values()}
+        folders[:] = [name for name in folders if name not in groups]
         found += [here / name for name in names if name.lower().endswith(SUFFIXES) and not name.startswith(".")]
     return found
 

@@ -117,7 +117,7 @@ def with_noise_intervals(estimate: Estimate) -> Estimate:
         below = result.log_likelihood.max() - result.log_likelihood
         if not margin or np.sum(below < REJECTED) > 2 * INTERVAL_LEVELS:
             break
-        levels = [_levels(r, below < margin * REJECTED) for r in _mesh(levels)]
+        levels = [_levels(np.asarray(r), below < margin * REJECTED) for r in _mesh(levels)]
     finer, (log_likelihood, log_sum) = _finer(levels, result.log_likelihood, np.log(result.residual_sum))
     kept = log_likelihood.max() - log_likelihood < REJECTED
     white = np.exp(log_sum[kept]) / result.degrees_of_freedom

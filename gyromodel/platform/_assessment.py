@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -229,5 +230,9 @@ def _further(rivals: dict[str, Explanation], at: Points, integrated: float) -> d
 
 
 def _apart(one: Explanation, other: Explanation, at: Points, test: Points) -> float:
-    """By how much either misses the other; one that contains the other never misses it."""
-    return max(separation(a, b.alternative, at, test, signed=True) for a, b in ((one, other), (other, one)))
+    """By how much either misses the other; one that contains the other, or that stays undetermined, never misses it."""
+    found = [0.0]
+    for a, b in ((one, other), (other, one)):
+        with suppress(EstimateError):
+            found.append(separation(a, b.alternative, at, test, signed=True))
+    return max(found)

@@ -42,7 +42,7 @@ SINGULAR = 1e-12
 
 
 class Part(NamedTuple):
-    """A candidate part of a test plan: what it is called, how long it takes (s), and what happens in it."""
+    """A candidate part of a test plan: what it is called, how long it takes (s) with its changeover, and its course."""
 
     name: str
     duration: float
@@ -88,7 +88,7 @@ def read_candidates(path: str | Path) -> list[Part]:
     """Candidate parts of a test plan.
 
     The file is a plan whose `columns` hold unless a part says otherwise, with a list `candidates` of parts, each with
-    a `name`, a `duration` and its own `columns`.
+    a `name`, a `duration` and its own `columns`. A `changeover` is the time that each part takes besides, each time.
 
     Raises:
         CampaignError: the file is none of that; the message names the part.
@@ -103,18 +103,23 @@ def read_candidates(path: str | Path) -> list[Part]:
     if missing or not isinstance(plan["columns"], dict) or not isinstance(plan["candidates"], list):
         raise CampaignError(f"{path}: needs interval, output, columns and a list of candidates")
     usual, parts = plan.pop("columns"), []
+    try:
+        changeover = seconds(plan.pop("changeover")) if "changeover" in plan else 0.0
+    except (CampaignError, UnitError) as error:
+        raise CampaignError(f"{path}: changeover: {error}") from None
     for number, given in enumerate(plan.pop("candidates"), 1):
         if not isinstance(given, dict) or set(given) - {"name", "columns"} != {"duration"}:
             raise CampaignError(f"{path}: candidate {number} needs a duration, and may have a name and columns")
         name, own = str(given.get("name", number)), given.get("columns") or {}
-        if not isinstance(own, dict) or (unknown := set(own) - set(usual)):
-            said = (
-                f"has a column {min(unknown)} that the others lack: state its usual value" if own else "has no columns"
+        if not isinstance(own, dict):
+            raise CampaignError(f"{path}: candidate {name}: columns must map column names to a value or to segments")
+        if unknown := [str(column) for column in own if column not in usual]:
+            raise CampaignError(
+                f"{path}: candidate {name} has a column {unknown[0]} that the others lack: state its usual value"
             )
-            raise CampaignError(f"{path}: candidate {name} {said}")
         try:
             campaign = planned({**plan, "duration": given["duration"], "columns": {**usual, **own}}, name)
-            parts.append(Part(name, seconds(given["duration"]), campaign))
+            parts.append(Part(name, seconds(given["duration"]) + changeover, campaign))
         except (CampaignError, UnitError) as error:
             raise CampaignError(f"{path}: candidate {name}: {error}") from None
     if len({part.name for part in parts}) < len(parts) or not parts:

@@ -1,0 +1,57 @@
+"""What the commands `batch` and `units` read, write and print: an archive's table of results."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from hashlib import sha256
+from pathlib import Path
+
+from gyromodel._console import print_table, progress_bar
+from gyromodel.batch import (
+    Batch,
+    Parameter,
+    copies,
+    pooled_table,
+    read_results,
+    run_batch,
+    unit_statistics,
+    write_table,
+)
+from gyromodel.model_files import read_model
+from gyromodel.report import with_uncertainty
+
+
+def batch_to(archive: str, model: Path, output: Path, diagnosing: bool, workers: int, scheduler: str | None) -> Batch:
+    """The archive examined, its table written."""
+    start, digest = read_model(model), sha256(model.read_bytes()).hexdigest()
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with progress_bar() as progress:
+        return run_batch(
+            archive, start, digest, output,
+            diagnosing=diagnosing, workers=workers, scheduler=scheduler, progress=progress,
+        )  # fmt: skip
+
+
+def units_of(results: Path, output: Path | None) -> Sequence[Parameter]:
+    """What a table says of each parameter; the campaigns' parameters as all units tell them are written."""
+    table = read_results(results)
+    found = unit_statistics(table)
+    if twice := copies(table):
+        print(f"gyromodel: the same data as others, and counted once: {', '.join(twice)}", file=sys.stderr)
+    if output:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        write_table(pooled_table(table, found), output)
+    return found
+
+
+def print_units(found: Sequence[Parameter]) -> None:
+    """A table, and what stands out."""
+    rows = [
+        (f"{s.parameter}{' ' * bool(s.axis)}{s.axis}", str(s.units), str(s.campaigns),
+         with_uncertainty(s.mean, s.mean_std, s.unit), f"{s.between.value:.3g}", f"{s.within.value:.3g}")
+        for s in found
+    ]  # fmt: skip
+    print_table(("parameter", "units", "campaigns", "mean", "unit to unit", "campaign to campaign"), rows)
+    for line in (line for statistics in found for line in statistics.sentences()):
+        print(f"- {line}")

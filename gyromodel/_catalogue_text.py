@@ -1,0 +1,45 @@
+"""The catalogue of effects and kinds of noise, as the command `effects` finds and prints it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from difflib import get_close_matches
+from typing import Any
+
+import typer
+
+from gyromodel._console import print_table
+from gyromodel.declarations import NOISE, declarations
+
+
+def entries(name: str | None) -> list[dict[str, Any]]:
+    """The whole catalogue as plain data, or the one entry of a name."""
+    every = declarations() | NOISE
+    if name is not None and name not in every:
+        close = get_close_matches(name, every, n=3)
+        hint = f"; did you mean {' or '.join(close)}?" if close else "; `gyromodel effects` lists them"
+        raise typer.BadParameter(f"no effect is called {name}{hint}", param_hint="ID")
+    return [asdict(every[name])] if name else [asdict(entry) for entry in every.values()]
+
+
+def print_catalogue(found: list[dict[str, Any]]) -> None:
+    """A line for each entry."""
+    rows = [
+        (e["id"], "noise", "–", e["meaning"])
+        if e["id"] in NOISE
+        else (e["id"], e["site"], ", ".join(e["needs"]) or "–", e["equation"])
+        for e in found
+    ]
+    print_table(("effect", "acts on", "needs", "equation"), rows)
+
+
+def print_entry(entry: dict[str, Any]) -> None:
+    """One entry, in full."""
+    if entry["id"] in NOISE:
+        print("\n".join(f"{name.replace('_', ' '):<15}{value}" for name, value in entry.items()))
+        return
+    print("\n".join(filter(None, [entry["id"], entry["equation"], entry["details"]])))
+    needs = ", ".join(entry["needs"]) or "no column"
+    print(f"\nacts on  {entry['site']}\nneeds    {needs}\ncause    {entry['cause']}\ntest     {entry['test']}\n")
+    rows = [(p["name"], f"{p['typical']:g}", p["unit"], p["meaning"]) for p in entry["parameters"]]
+    print_table(("parameter", "typical", "unit", "meaning"), rows)
