@@ -179,7 +179,8 @@ def test_an_effect_whose_fit_fails_is_told_and_not_tried_again(monkeypatch: pyte
         {"kind": "rate"},
     )
     found = gm.diagnose(campaign, gm.model_from_effects(["bias"]), hold_out=False)
-    assert tried == [["bias_temperature"]]
+    # Besides the fits that weigh it against near rivals, which give up rows.
+    assert tried.count(["bias_temperature"]) == 1
     assert found.verdict == "unknown"
     assert any("bias_temperature is still significant" in line for line in found.findings)
 

@@ -80,6 +80,11 @@ class Ranking:
         """Form, explained sum and dimension of a candidate where it is best."""
         return self.results[self.best_cell(name)].best[name]
 
+    def explained(self, name: str) -> float:
+        """Part of the residual sum of squares that a candidate's best form explains, where it is best."""
+        result = self.results[self.best_cell(name)]
+        return result.best[name][1] / result.rss
+
     def twins(self, name: str) -> set[str]:
         """Effects that explain as much of the data as a candidate, with at most one coefficient more.
 

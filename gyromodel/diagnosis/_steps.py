@@ -17,8 +17,8 @@ from gyromodel.noise import NoiseRatios
 
 NoisePath = Sequence[NoiseRatios]
 
-# Part of its evidence that an effect may lose for a shape that lies between those searched.
-BETWEEN = 0.15
+# Part of what it explains that an effect may lose for a shape that lies between those searched.
+BETWEEN = 0.05
 # By how many nats a candidate must beat another to take its place.
 EXCHANGE = 2.0
 
@@ -97,9 +97,10 @@ class Steps:
         """
         ranking = rank_where_it_matters(self.scanner, estimate, rows_of(found))
         (name, score), driver = ranking.best(drivers=False), ranking.best(drivers=True)[1]
-        near = {k for k, v in ranking.statistic.items() if v >= (1.0 - BETWEEN) * score and self._has_shape(k)}
         if BETWEEN * score < EXCHANGE or not name or not self.scanner.bank.forms(name):
             return ranking
+        least = (1.0 - BETWEEN) * ranking.explained(name)
+        near = {k for k in ranking.statistic if self._has_shape(k) and ranking.explained(k) >= least}
         if not near - {name} and (name not in near or driver < score):
             return ranking
         each = [self.step(found, estimate, ranking, k) for k in {name, *near}]
