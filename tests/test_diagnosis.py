@@ -166,10 +166,10 @@ def test_units_of_the_output_change_nothing(seed: int) -> None:
 def test_an_effect_whose_fit_fails_is_told_and_not_tried_again(monkeypatch: pytest.MonkeyPatch):
     tried = []
 
-    def fails(record: object, baseline: object, found: list, *_: object) -> None:
+    def fails(_: object, found: list) -> None:
         tried.append([f.name for f in found])
 
-    monkeypatch.setattr("gyromodel.diagnosis._search.refit", fails)
+    monkeypatch.setattr("gyromodel.diagnosis._steps.Steps.fit", fails)
     rng = np.random.default_rng(3)
     temperature = 20.0 + 10.0 * np.sin(np.arange(300) / 20.0)
     output = 0.01 * temperature + 0.01 * rng.standard_normal(300)
@@ -179,7 +179,8 @@ def test_an_effect_whose_fit_fails_is_told_and_not_tried_again(monkeypatch: pyte
         {"kind": "rate"},
     )
     found = gm.diagnose(campaign, gm.model_from_effects(["bias"]), hold_out=False)
-    assert tried == [["bias_temperature"]]
+    # Besides the fits that weigh it against near rivals, which give up rows.
+    assert tried.count(["bias_temperature"]) == 1
     assert found.verdict == "unknown"
     assert any("bias_temperature is still significant" in line for line in found.findings)
 

@@ -181,7 +181,7 @@ def test_steps_of_the_output_are_said_of(quantum: float, said: bool, rng: np.ran
 
 
 @pytest.mark.parametrize(
-    ("quantum", "repeats", "said"), [(0.0, 4, False), (0.0, 5, True), (0.05, 6, False), (0.05, 40, True)]
+    ("quantum", "repeats", "said"), [(0.0, 4, False), (0.0, 7, True), (0.05, 6, False), (0.05, 40, True)]
 )
 def test_a_stretch_that_stands_still_is_said_of(quantum: float, repeats: int, said: bool, rng: np.random.Generator):
     """A dead stretch under noise of 0.05 deg/s; coarse steps repeat by chance, so that it takes more of them.
@@ -201,3 +201,14 @@ def test_a_stretch_that_stands_still_is_said_of(quantum: float, repeats: int, sa
         told += sentence is not None
         assert quantum or sentence is None or f"0.25 deg/s in data rows 101 to {100 + repeats} of" in sentence
     assert told == 20 if said else binom.sf(told - 1, 20, 0.01) > 1e-5
+
+
+@pytest.mark.parametrize("steps", [1.0, 2.0, 3.0])
+def test_a_coarse_output_that_drifts_does_not_stand_still(steps: float, rng: np.random.Generator):
+    """Amid a step of three standard deviations a value follows itself with probability 0.87, at its edge with 0.5."""
+    for _ in range(20):
+        output = np.round(10.0 * np.sin(np.arange(3000) / 500.0) + rng.standard_normal(3000) / steps)
+        campaign = gm.Campaign(
+            {"time": np.arange(3000.0), "output": 0.01 * output}, {"time": "s", "output": "deg/s"}, {"kind": "rate"}
+        )
+        assert stretch_still(campaign) is None

@@ -71,6 +71,10 @@ class Bank:
         """Every candidate once: blocks, then fast scans."""
         return tuple(dict.fromkeys([b.name for b in self.blocks] + list(self.scans)))
 
+    def forms(self, name: str) -> list[Effect]:
+        """The forms of a catalogue effect that are laid out as columns."""
+        return [b.effect for b in self.blocks if b.name == name and b.effect is not None]
+
     def layout(self) -> dict[int, tuple[int, int, int]]:
         """By width: the first block of that width, how many there are, and the first one's first column."""
         widths = [b.width for b in self.blocks]

@@ -14,6 +14,7 @@ from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores
 from gyromodel.diagnosis._data import read
 from gyromodel.diagnosis._evidence import SAFE_THRESHOLD
+from gyromodel.diagnosis._exchange import SLOW_IN_TIME
 from gyromodel.diagnosis._gain import ladder_error, nested_gain, no_gain, not_measured
 from gyromodel.diagnosis._isolation import settling_test
 from gyromodel.diagnosis._noise_causes import as_cause, quantisation, telegraph
@@ -21,8 +22,9 @@ from gyromodel.diagnosis._points import dwells_apart
 from gyromodel.diagnosis._ranking import Ranking, cells_of_weight, is_driver, is_noise, noise_kinds
 from gyromodel.diagnosis._result import Candidate, Cause, Diagnosis, Gain, ParameterValue, Round
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._search import SLOW_IN_TIME, Found, NoisePath, Progress, Selection, search, standing
+from gyromodel.diagnosis._search import Progress, Selection, search
 from gyromodel.diagnosis._shapes import driver_shape, minimum_detectable, not_testable
+from gyromodel.diagnosis._steps import Found, NoisePath, Steps, standing
 from gyromodel.diagnosis._variance import follow, growing_noise, noise_level, tails, with_variance
 from gyromodel.diagnosis._verdict import judge, structured, with_noise
 from gyromodel.estimate import Estimate, EstimateError, check_covariates, fit_record, with_noise_intervals
@@ -51,7 +53,7 @@ class _Session:
 
     def run(self, baseline: Estimate, progress: Progress = None, noise: NoisePath = ()) -> Selection:
         """The rounds."""
-        return search(self.record, self.scanner, baseline, self.threshold, progress=progress, noise=noise)
+        return search(Steps(self.scanner, baseline, self.threshold, noise), progress)
 
     def pruned(self, selection: Selection) -> Selection:
         """The rounds, cut where (after the first step) the error on blocks left out stops falling."""
@@ -164,7 +166,8 @@ def diagnose(
             "Parameters weigh all samples alike: that predicts left-out blocks better than the fitted noise's weights "
             "do."
         )
-    judgement = judge(record, session.scanner, baseline, selection, extended, len(bank.names()), nulls, data.rows_of)
+    steps = Steps(session.scanner, baseline, session.threshold)
+    judgement = judge(steps, selection, extended, len(bank.names()), nulls, data.rows_of)
     if following and grows and judgement.verdict == "adequate":
         judgement = structured(judgement, selection.last, grows.column)
     stepped = None

@@ -26,6 +26,7 @@ SLOW, LAGS = 0.05, (0.01, 0.03, 0.08)
 # Samples before and after, whose rates stand for a linear response of any form (those after for its smooth part at the
 # ends of a run), and the least part of steps at which rates move.
 RESPONSE, MOVING = (13, 5, 2, 1, -1, -2), 0.5
+RESPONSE_DRIVER = f"smooth({RATE_OF.format('rate')})"
 # What `compensate` adds is the output itself; every function of the ramp's code is bias_readout_code.
 NOT_DRIVERS = ("time", "output", "segment", "run", "position", "feedback_ramp", "rate_estimated", "rate_estimated_std")
 
@@ -154,7 +155,7 @@ def _response(record: Record) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     # Of columns so much alike only what is left of each beside those before can be weighed.
     inside = np.column_stack([np.ones(record.rows), rate, before[: record.rows]])
     before[: record.rows] = np.linalg.qr(inside)[0][:, 2:]
-    yield f"smooth({RATE_OF.format('rate')})", along, before
+    yield RESPONSE_DRIVER, along, before
 
 
 def _history(record: Record, name: str) -> Iterator[tuple[str, np.ndarray]]:

@@ -24,12 +24,17 @@ MAXIMUM_LINES = 6
 ABOVE_LEAKAGE = 4.0
 # … and have this evidence (nats) by itself, the search over frequencies paid for.
 LINE_MARGIN = 8.0
+# Part of the samples that may be given up because an effect does not know what was before them.
+MOST_UNKNOWN = 0.25
 
 
 def addition(
     scanner: Scanner, estimate: Estimate, ranking: Ranking, name: str, pulses: tuple[int, ...]
 ) -> tuple[Effect | None, tuple[int, ...]]:
-    """A named candidate as an effect at its best form, or as rows given up; neither for noise that is not stated."""
+    """A named candidate as an effect at its best form, and the rows given up with it.
+
+    Rows alone for gross errors; neither for noise that is not stated.
+    """
     if is_noise(name):
         return None, ()
     form, _, _ = ranking.best_form(name)
@@ -48,7 +53,9 @@ def addition(
         effect = BiasPeriodic(cosine=none, sine=none, frequency=jnp.asarray(frequency))
     for held in estimate.model.effects:
         effect = effect.joined(held) if held.label == effect.label and effect.label in effect.supersedes else effect
-    return _solved(scanner, estimate, effect, ranking.best_cell(name), pulses).settled(), ()
+    effect = _solved(scanner, estimate, effect, ranking.best_cell(name), pulses).settled()
+    rows = np.flatnonzero(scanner.present & np.asarray(effect.unknown(scanner.record.signals)))
+    return effect, tuple(map(int, rows)) if len(rows) < MOST_UNKNOWN * scanner.present.sum() else ()
 
 
 def _lines(scanner: Scanner, ranking: Ranking, model: GyroModel) -> np.ndarray:

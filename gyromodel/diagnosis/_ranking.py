@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gyromodel._checks import thermometers
+from gyromodel.diagnosis._drivers import RESPONSE_DRIVER
 from gyromodel.diagnosis._evidence import log_sum
 from gyromodel.diagnosis._scan import CellResult, Scanner
 from gyromodel.diagnosis._tangents import Tangent
@@ -30,7 +31,7 @@ ALIKE = 0.2
 
 @dataclass(frozen=True)
 class Ranking:
-    """Evidence of every candidate summed over noise cells, against nothing added."""
+    """Evidence of every candidate summed over noise cells, against nothing added; of those `fitted` by their fits."""
 
     statistic: dict[str, float]
     posterior: dict[str, float]
@@ -42,9 +43,15 @@ class Ranking:
     residual: np.ndarray = field(repr=False)
     samples: int
     tangents: dict[str, Tangent] = field(default_factory=dict, repr=False)
+    fitted: frozenset[str] = frozenset()
 
     def best(self, *, drivers: bool, but: tuple[str, ...] = ()) -> tuple[str | None, float]:
-        """The best unknown driver, or the best named candidate (but some), and its evidence ratio (ln)."""
+        """The best unknown driver, or the best named candidate (but some), and its evidence ratio (ln).
+
+        Lines that any response to the motion explains better are the motion's own.
+        """
+        if self.statistic.get(RESPONSE_DRIVER, -np.inf) > self.statistic.get("bias_periodic", -np.inf):
+            but = (*but, "bias_periodic")
         mine = {k: v for k, v in self.statistic.items() if is_driver(k) == drivers and k not in but}
         # Of names that are the same on this campaign the first, whatever the rounding.
         top = max(mine, key=lambda k: round(mine[k], 6)) if mine else None
@@ -73,13 +80,20 @@ class Ranking:
         """Form, explained sum and dimension of a candidate where it is best."""
         return self.results[self.best_cell(name)].best[name]
 
+    def explained(self, name: str) -> float:
+        """Part of the residual sum of squares that a candidate's best form explains, where it is best."""
+        result = self.results[self.best_cell(name)]
+        return result.best[name][1] / result.rss
+
     def twins(self, name: str) -> set[str]:
         """Effects that explain as much of the data as a candidate, with at most one coefficient more.
 
         Their signals hold the candidate's: no size of it would tell them apart on this campaign. A form
         that contains another which was searched is no twin: it follows whatever that one leaves. Nor is a step one of
-        a bias, which it becomes at an end of the record.
+        a bias, which it becomes at an end of the record; fits tell what the shapes searched cannot.
         """
+        if name in self.fitted:
+            return set()
         result = self.results[self.best_cell(name)]
         _, explained, q = result.best[name]
         least = explained - ALIKE * (result.rss - explained) / self.samples

@@ -24,8 +24,9 @@ CONTRADICTED = 1e-4
 CHANGED = 1.2
 # Steps of the output are said of where each level comes so often, or from this part of the output's scatter on.
 OFTEN, COARSE = 50, 0.5
-# A stretch that stands still is said of from so many repeats on, and where its other values make it less likely.
-FEWEST_REPEATS, CHANCE = 4, 1e-4
+# A stretch that stands still is said of from so many repeats on, and where its other values make it less likely;
+# never where more of them repeat than this, as one amid a coarse step then stands by itself.
+FEWEST_REPEATS, CHANCE, MOST_REPEATS = 4, 1e-4, 0.5
 
 
 def variance_drivers(record: Record) -> dict[str, np.ndarray]:
@@ -160,7 +161,9 @@ def stretch_still(campaign: Campaign) -> str | None:
     start, stop = edges[longest : longest + 2]
     repeats = stop - start - 1
     others = (len(values) - len(edges) + 1 - repeats + 1) / len(values)
-    if repeats < FEWEST_REPEATS or np.log(len(values)) + repeats * np.log(others) > np.log(CHANCE):
+    # A value of probability p follows itself with p, and the mean over values of p² is what the others show.
+    likely = np.log(len(values)) + 0.5 * repeats * np.log(others)
+    if repeats < FEWEST_REPEATS or others > MOST_REPEATS or likely > np.log(CHANCE):
         return None
     return (
         f"The output stands at {values[start]:.6g} {campaign.units[name]} in data rows {start + 1} to {stop} of "

@@ -12,19 +12,13 @@ from scipy import stats
 from gyromodel.campaign import Campaign
 from gyromodel.declarations import EARLIER, RATE_OF, measured
 from gyromodel.diagnosis._drivers import smooth_columns
+from gyromodel.diagnosis._exchange import SLOW_IN_TIME, uncontested
 from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise
 from gyromodel.diagnosis._result import Cause, Confuser, ParameterValue, Verdict
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._search import (
-    SLOW_IN_TIME,
-    TIME_MARGIN,
-    Found,
-    Selection,
-    leave_one_out,
-    like,
-    uncontested,
-)
+from gyromodel.diagnosis._search import TIME_MARGIN, Selection, like
 from gyromodel.diagnosis._shapes import remaining, separation
+from gyromodel.diagnosis._steps import Found, Steps
 from gyromodel.estimate import Estimate
 from gyromodel.model import effect_class
 from gyromodel.signals import Record
@@ -34,6 +28,8 @@ from gyromodel.units import factor
 CREDIBLE = 0.95
 # Where the noise has a random walk even with them, these have no edge that a walk could not make, whatever their lead.
 NO_EDGE = ("bias_drift", "bias_warmup")
+# Standard uncertainties from which on a parameter has a size.
+VAGUE = 2.0
 # Gross errors that are listed by row.
 ROWS_TOLD = 12
 # A driver that names leave with more than this share of the structure makes the discrepancy unknown.
@@ -95,9 +91,7 @@ def _supersedes(name: str) -> tuple[str, ...]:
 
 
 def judge(
-    record: Record,
-    scanner: Scanner,
-    baseline: Estimate,
+    steps: Steps,
     selection: Selection,
     extended: Estimate,
     trials: int,
@@ -105,10 +99,11 @@ def judge(
     searched: Sequence[tuple[Campaign, bool]],
 ) -> Judgement:
     """The verdict on a finished search; `searched`: the record's campaigns, and whether they are as given."""
+    scanner, baseline, record = steps.scanner, steps.baseline, steps.scanner.record
     found = list(selection.found)
     runs = scanner.runs
     causes, sets, findings = [], [], []
-    given_up = sorted(row for step in found if step.name == "outliers" for row in step.rows)
+    given_up = sorted(row for step in found for row in step.points)
     if given_up and not scanner.by_points:
         what = f"{len(given_up)} gross errors" if len(given_up) > 1 else "A gross error"
         findings.append(f"{what} {_places(given_up, searched)}: given up, not modelled.")
@@ -118,20 +113,24 @@ def judge(
                 f"{one.name} and {other.name} show together and hardly alone: much alike on this campaign, they all "
                 "but cancel."
             )
+    for step in (f for f in found if f.rows and not f.points):
+        findings.append(
+            f"{len(step.rows)} samples next to gaps or the record's ends were left out beside {step.name}: what was "
+            "not recorded still shows there."
+        )
     for i, step in enumerate(found):
         ranking, name = selection.left_out.get(i), step.name
         if ranking is None and len(found) > 1 and not uncontested(step):
-            ranking = leave_one_out(record, scanner, baseline, found, i)
+            rest = steps.all_but(found, i)
+            ranking = rest[1] if rest else None
         if ranking is None or name not in ranking.statistic:
             ranking = step.ranking
         statistic = ranking.statistic[name]
         beside = frozenset(f.name for f in found if f is not step)
-        # Where more is left than this explains, this may be a part of it.
-        left = selection.last.statistic.get(selection.remains, -np.inf)
-        beside = beside - {selection.remains} if left > statistic else beside | {selection.remains}
-        members = credible(ranking, name, statistic, runs=runs, beside=beside)
+        # What was not added may stand in the place of this.
+        members = credible(ranking, name, statistic, runs=runs, beside=beside - {selection.remains})
         if name == "outliers":
-            if scanner.by_points and _unrepeated(record, step.rows):
+            if scanner.by_points and _unrepeated(record, step.points):
                 members = {k: 0.5 * share for k, share in members.items()} | {"scale_spline": 0.5}
             elif not scanner.by_points:
                 continue
@@ -144,6 +143,11 @@ def judge(
         turn = sum(f.name == name for f in found[i:])
         causes.append(_cause(scanner, extended, step, turn, ranking, members, statistic, trials, null_scores))
         sets.append(members)
+    # Of these only something in common has a size: which of them it is, this campaign cannot tell.
+    vague = [c.effect for c in causes if any(p.std for p in c.parameters) and not any(map(_sized, c.parameters))]
+    if len(vague) > 1:
+        shared = dict.fromkeys(vague, 1.0 / len(vague))
+        sets = [members | shared if c.effect in vague else members for c, members in zip(causes, sets, strict=True)]
     order = sorted(range(len(causes)), key=lambda i: -causes[i].statistic)
     causes, sets = [causes[i] for i in order], [sets[i] for i in order]
     if selection.remains:
@@ -181,6 +185,10 @@ def judge(
     firm = tuple(c for c in named if c.effect not in sets[0])
     test = _next_test(list(sets[0]), record, causes[0])
     return Judgement("ambiguous", (*doubtful, *firm), sets[0], None, test, unexplained, tuple(findings))
+
+
+def _sized(parameter: ParameterValue) -> bool:
+    return bool(0.0 < VAGUE * parameter.std < abs(parameter.value))
 
 
 def _places(rows: Sequence[int], searched: Sequence[tuple[Campaign, bool]]) -> str:
@@ -313,14 +321,14 @@ def _cause(
     _, explained, q = result.best[name]
     nu = scanner.degrees_of_freedom - ranking.baseline_columns.shape[1]
     p = float(stats.beta.sf(min(explained / result.rss, 1.0), q / 2, max(nu - q, 1) / 2))
-    shapes = comb(len(result.energy[name]), int(q)) if step.rows else len(result.energy.get(name, ())) or 1
+    shapes = comb(len(result.energy[name]), int(q)) if step.points else len(result.energy.get(name, ())) or 1
     adjusted = float(min(1.0, p * shapes * trials))
     if len(null_scores):
         adjusted = float((1 + np.sum(null_scores >= statistic)) / (1 + len(null_scores)))
     rivals = sorted((k for k in ranking.statistic if k != name), key=lambda k: -ranking.statistic[k])[:4]
     confusers = tuple(Confuser(k, s) for k in rivals if (s := separation(scanner, ranking, name, k)) is not None)
-    if step.rows:
-        parameters = _point_parameters(scanner.record, estimate, step.rows)
+    if step.points:
+        parameters = _point_parameters(scanner.record, estimate, step.points)
         if "scale_spline" in members:
             confusers = (Confuser("scale_spline", 0.0), *confusers)
     else:
@@ -329,7 +337,7 @@ def _cause(
         each = len(rows) // estimate.model.labels.count(name)
         rows = rows[len(rows) - turn * each :][:each]
         parameters = tuple(ParameterValue(r.name, r.value, r.std, r.unit) for r in rows)
-    return Cause(name, parameters, statistic, p, adjusted, members.get(name, 0.0), confusers, tuple(step.rows))
+    return Cause(name, parameters, statistic, p, adjusted, members.get(name, 0.0), confusers, step.points)
 
 
 def _point_parameters(record: Record, estimate: Estimate, rows: tuple[int, ...]) -> tuple[ParameterValue, ...]:

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from gyromodel._checks import accelerations, thermometers
 
@@ -151,6 +151,10 @@ class Effect(eqx.Module):
     def leaves(self, signals: Signals) -> float:
         """Size (internal units) of what its columns may leave of it, for which other effects must not be taken."""
         return 0.0
+
+    def unknown(self, signals: Signals) -> Bool[Array, " sample"]:
+        """Samples at which what was before the record, or in a gap, still shows, so that its columns may err there."""
+        return jnp.zeros(len(signals["time"]), bool)
 
     def joined(self, held: Effect) -> Self:
         """What takes the place of the same effect in another form where a model holds that, without coefficients."""

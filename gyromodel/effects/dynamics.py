@@ -10,7 +10,7 @@ from typing import Self
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from gyromodel.effects._base import Effect, Signals, parameter, stack
 
@@ -20,6 +20,8 @@ GAP = 10.0
 RESOLVED = 0.5
 # Steps by which a rate is continued before the first sample.
 CONTINUED = 2.0
+# Time constants after which a lag has forgotten where it began.
+FORGOTTEN = 5.0
 # Delays and lags searched, in sample intervals: where only their product with the slope shows, to many.
 SHORTEST, LONGEST, STEPS = 0.05, 16.0, 40
 
@@ -46,6 +48,11 @@ class TimeDelay(Effect):
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """ω(t − δ) − ω(t)."""
         return stack(earlier(signals["time"], signals["rate"], self.delay) - signals["rate"])
+
+    def unknown(self, signals: Signals) -> Bool[Array, " sample"]:
+        """Where the rate so much before or after was not recorded."""
+        clock, first, last = _clock(signals["time"])
+        return (clock - self.delay < clock[first]) | (clock - self.delay > clock[last])
 
     def settled(self) -> Self:
         """All of the output is late, by as much as has the same slope."""
@@ -86,6 +93,11 @@ class Bandwidth(Effect):
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """y − ω."""
         return stack(lag(signals["time"], signals["rate"], self.time_constant))
+
+    def unknown(self, signals: Signals) -> Bool[Array, " sample"]:
+        """The first time constants, as only a steady change before them is allowed for."""
+        clock, first, _ = _clock(signals["time"])
+        return clock - clock[first] < FORGOTTEN * self.time_constant
 
     def settled(self) -> Self:
         """All of the output lags, by as much as has the same slope."""
@@ -129,10 +141,13 @@ def _interval(signals: Signals) -> float:
 
 def resolved(signals: Signals, name: str = "rate") -> bool:
     """Whether a rate changes from sample to sample in a way that tells what it does between them."""
-    change = np.diff(np.asarray(signals[name]))[np.diff(np.asarray(signals["time"])) > 0]
-    if not np.ptp(change) > 0:
+    step = np.diff(np.asarray(signals["time"]))
+    within = (step > 0) & (step <= GAP * _interval(signals))
+    change, pairs = np.diff(np.asarray(signals[name])), within[1:] & within[:-1]
+    one, next_one = change[:-1][pairs], change[1:][pairs]
+    if not len(one) or not (np.ptp(one) > 0 and np.ptp(next_one) > 0):
         return False
-    return bool(np.corrcoef(change[1:], change[:-1])[0, 1] > RESOLVED)
+    return bool(np.corrcoef(one, next_one)[0, 1] > RESOLVED)
 
 
 def _usual(time: Float[Array, " sample"]) -> Float[Array, ""]:

@@ -1,0 +1,102 @@
+"""Steps of a search chosen again, each beside all the others."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise
+from gyromodel.diagnosis._steps import EXCHANGE, Found, Steps, standing
+from gyromodel.estimate import Estimate
+
+# Lines that lead every other name by this much (nats) are not chosen again.
+LINE_LEAD = 20.0
+# Functions of time that one run cannot tell from a random walk, and the lead (nats) over it at which they are put
+# beside it.
+SLOW_IN_TIME = ("bias_drift", "bias_warmup", "bias_step")
+SLOW_LEAD = 2.5
+
+
+def exchanged(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[list[Found], Estimate, dict[int, Ranking]]:
+    """Choose each addition again given all the others, and drop those that the others have made needless.
+
+    Returns:
+        What stands, its fit, and the rankings beside all but one that speak of it.
+    """
+    while True:
+        found, estimate, rankings = _chosen_again(steps, found, estimate)
+        own = {i: r.statistic[found[i].name] for i, r in rankings.items() if found[i].name in r.statistic}
+        needless = [i for i, v in own.items() if v < (SLOW_LEAD if found[i].name in SLOW_IN_TIME else steps.threshold)]
+        if not needless or len(found) < 2:
+            return found, estimate, rankings
+        least = min(needless, key=lambda i: own[i])
+        fewer = found[:least] + found[least + 1 :]
+        after = steps.fit(fewer)
+        if after is None:
+            return found, estimate, rankings
+        found, estimate = fewer, after
+
+
+def _chosen_again(
+    steps: Steps, found: list[Found], estimate: Estimate
+) -> tuple[list[Found], Estimate, dict[int, Ranking]]:
+    """One pass: each addition exchanged for a better one given all the others."""
+    rankings: dict[int, Ranking] = {}
+    for i in range(len(found) if len(found) > 1 else 0):
+        if found[i].effect is None or uncontested(found[i]) or (rest := steps.all_but(found, i)) is None:
+            continue
+        base, rankings[i] = rest
+        ranking, others = rankings[i], found[:i] + found[i + 1 :]
+        # Further lines would come on top of the others, not in the place of this one.
+        lines = any(f.name == "bias_periodic" for f in others)
+        name, score = ranking.best(drivers=False, but=("bias_periodic",) if lines else ())
+        own = ranking.statistic.get(found[i].name, -np.inf)
+        if (
+            name is None
+            # It went with what it grew from, which the others do not hold.
+            or found[i].name not in ranking.statistic
+            or is_noise(name)
+            or name in (found[i].name, "outliers")
+            or score < max(own + EXCHANGE, steps.threshold)
+        ):
+            continue
+        step = steps.step(others, base, ranking, name)
+        changed = [*others[:i], step, *others[i:]]
+        if len(standing(changed)) < len(changed):
+            continue
+        after = steps.fit(changed)
+        if after is None or not steps.fits_better(changed, found):
+            continue
+        if not unresolved(after, step, steps.scanner.step):
+            found, estimate, rankings = changed, after, {i: ranking}
+    return found, estimate, rankings
+
+
+def uncontested(step: Found) -> bool:
+    """Whether it is lines that led every other name by far when they were added: nothing else makes a line."""
+    rivals = [v for k, v in step.ranking.statistic.items() if k not in (step.name, "outliers") and not is_driver(k)]
+    own = step.ranking.statistic.get(step.name, -np.inf)
+    return step.name == "bias_periodic" and own > max(rivals, default=-np.inf) + LINE_LEAD
+
+
+def unresolved(estimate: Estimate, step: Found, reading: float) -> str:
+    """Why an effect says nothing, as it is nowhere larger than what passes for it; `reading`: the step of readings.
+
+    Readings of what moves within a step stand still, and a still reading of a moving thing is an error that follows
+    the motion: it is not the noise that the evidence weighs. Nor is what another effect may leave.
+    """
+    model, record = estimate.model, estimate.record
+    if record.domain == "gyro" or step.effect is None or step.effect.label not in model.labels:
+        return ""
+    effect = model.effects[model.labels.index(step.effect.label)]
+    size = float(np.abs(np.asarray(effect.contribution(record.signals))[: record.rows]).max())
+    left = {e.label: e.leaves(record.signals) for e in model.effects if e.label != effect.label}
+    other = max(left, key=lambda label: left[label], default="")
+    if reading and size < 0.5 * reading:
+        within = f"half a step of the encoders ({np.rad2deg(reading):.2g} deg)"
+        passes = "readings that stand still pass"
+    elif other and size < left[other]:
+        within = f"{np.rad2deg(left[other]):.2g} deg"
+        passes = f"what sticks, which {other} leaves out, passes"
+    else:
+        return ""
+    return f"{step.name} would be within {within} throughout, where {passes} for it: not named."

@@ -1,0 +1,183 @@
+"""Steps of a search: what each adds, the fit of the simulation with them, and all candidates ranked beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from gyromodel.diagnosis._forms import addition
+from gyromodel.diagnosis._ranking import Ranking, is_noise, rank_where_it_matters
+from gyromodel.diagnosis._scan import CLEARLY, Scanner
+from gyromodel.effects import Effect
+from gyromodel.estimate import Estimate, EstimateError, fit_record
+from gyromodel.model import GyroModel
+from gyromodel.noise import NoiseRatios
+
+NoisePath = Sequence[NoiseRatios]
+
+# Part of what it explains that an effect may lose for a shape that lies between those searched.
+BETWEEN = 0.05
+# By how many nats a candidate must beat another to take its place.
+EXCHANGE = 2.0
+
+
+@dataclass(frozen=True)
+class Found:
+    """One accepted addition and the ranking that spoke for it; `rows` are given up with it.
+
+    `paired`: the first of two that show together and not alone; the next is the other.
+    """
+
+    name: str
+    effect: Effect | None
+    rows: tuple[int, ...]
+    ranking: Ranking
+    paired: bool = False
+
+    @property
+    def frees_noise(self) -> bool:
+        """Whether it says that the stated noise lacks something, so that the noise is estimated from here on."""
+        return is_noise(self.name)
+
+    @property
+    def points(self) -> tuple[int, ...]:
+        """The rows that are themselves what was found."""
+        return self.rows if self.name == "outliers" else ()
+
+
+@dataclass(frozen=True)
+class Steps:
+    """What stays the same while steps are tried.
+
+    Attributes:
+        scanner: the search laid out on the data.
+        baseline: the fitted simulation.
+        threshold: least ln evidence ratio of an addition.
+        noise: ratios to hold in the fits, by the number of additions (the last for more); none: estimate them.
+    """
+
+    scanner: Scanner = field(repr=False)
+    baseline: Estimate
+    threshold: float
+    noise: NoisePath = ()
+
+    def fit(self, found: Sequence[Found]) -> Estimate | None:
+        """The simulation with everything found; shapes that cannot be estimated stay at the searched value."""
+        ratios = self.noise[min(len(found), len(self.noise) - 1)] if self.noise else None
+        model, freed = self.baseline.model, [f.name for f in found if f.frees_noise]
+        given = self.baseline.noise_given and not freed
+        for step in found:
+            if step.effect is not None:
+                model = model.with_effect(step.effect)
+        rows = rows_of(found)
+        data = self.scanner.record.without(np.array(rows)) if rows else self.scanner.record
+        model = replace(model, noise=self.baseline.model.noise if given else {})
+        for attempt in (model, _shapes_held(model, found)):
+            try:
+                # Another solver would be compiled anew for each model, and has rescued none that this one lost.
+                after = fit_record(
+                    data,
+                    attempt,
+                    ratios=ratios,
+                    markov="noise_markov" in freed if freed else None,
+                    solver="levenberg_marquardt",
+                )
+            except EstimateError:
+                continue
+            if not _negative(after, found):
+                return after
+        return None
+
+    def rank(self, estimate: Estimate, found: Sequence[Found]) -> Ranking:
+        """All candidates beside a fit with what was found; by their fits where the shapes searched mislead.
+
+        A shape between those searched loses a part of what it explains: of much evidence, more than a rival's lead.
+        """
+        ranking = rank_where_it_matters(self.scanner, estimate, rows_of(found))
+        (name, score), driver = ranking.best(drivers=False), ranking.best(drivers=True)[1]
+        if BETWEEN * score < EXCHANGE or not name or not self.scanner.bank.forms(name):
+            return ranking
+        least = (1.0 - BETWEEN) * ranking.explained(name)
+        near = {k for k in ranking.statistic if self._has_shape(k) and ranking.explained(k) >= least}
+        if not near - {name} and (name not in near or driver < score):
+            return ranking
+        each = [self.step(found, estimate, ranking, k) for k in {name, *near}]
+        # Fits compare on the same data.
+        given_up = Found("", None, rows_of(each), ranking)
+        fits = {step.name: self.fit(standing([*found, step, given_up])) for step in each}
+        quality = {k: _quality(fit) for k, fit in fits.items() if fit is not None}
+        before = self.fit([*found, given_up])
+        if name not in quality or before is None:
+            return ranking
+        if driver < score and max(quality.values()) < quality[name] + EXCHANGE:
+            return ranking
+        own = max(score, quality[name] - _quality(before))
+        told = {k: own + v - quality[name] for k, v in quality.items()}
+        return replace(ranking, statistic=ranking.statistic | told, fitted=frozenset(told))
+
+    def fits_better(self, found: Sequence[Found], other: Sequence[Found]) -> bool:
+        """Whether some steps fit better than others, on the data that both keep."""
+        given_up = Found("", None, rows_of([*found, *other]), found[0].ranking)
+        one, two = (self.fit([*steps, given_up]) for steps in (found, other))
+        return one is not None and (two is None or _quality(one) > _quality(two))
+
+    def _has_shape(self, name: str) -> bool:
+        """Whether a candidate's shape goes on between the forms searched; a fit of a platform takes too long for it."""
+        forms = self.scanner.bank.forms(name) if self.scanner.record.domain == "gyro" else []
+        return len(forms) > 1 and any(not declared.linear for declared in forms[0].declared().values())
+
+    def step(self, found: Sequence[Found], estimate: Estimate, ranking: Ranking, name: str) -> Found:
+        """A candidate of a ranking beside what was found, as one more step."""
+        return Found(name, *addition(self.scanner, estimate, ranking, name, rows_of(found)), ranking)
+
+    def all_but(self, found: Sequence[Found], i: int) -> tuple[Estimate, Ranking] | None:
+        """The fit with everything found except item i, and all candidates beside it; none where that fit fails."""
+        others = [*found[:i], *found[i + 1 :]]
+        estimate = self.fit(others)
+        return None if estimate is None else (estimate, self.rank(estimate, others))
+
+
+def standing(path: Sequence[Found]) -> list[Found]:
+    """The steps of a path that no later step replaced by a more general form."""
+    later: set[str] = set()
+    kept = []
+    for step in reversed(path):
+        if step.name not in later:
+            kept.append(step)
+        later |= set(step.effect.supersedes) if step.effect is not None else set()
+    return kept[::-1]
+
+
+def _quality(estimate: Estimate) -> float:
+    """ln likelihood of a fit, less what its parameters cost (Schwarz): by it fits of different parameters compare."""
+    p = len(estimate.covariance)
+    volume = np.linalg.slogdet(estimate.covariance)[1]
+    return estimate.log_likelihood - 0.5 * (volume + p * np.log(estimate.degrees_of_freedom + p))
+
+
+def rows_of(found: Sequence[Found]) -> tuple[int, ...]:
+    """The rows given up with some steps."""
+    return tuple(sorted({r for f in found for r in f.rows}))
+
+
+def _negative(estimate: Estimate, found: Sequence[Found]) -> bool:
+    """Whether something found is clearly below zero in a coefficient that cannot be."""
+    of = {f.effect.label for f in found if f.effect is not None and f.effect.positive}
+    return any(
+        slot.linear and estimate.model.labels[slot.effect] in of and value < -CLEARLY * std
+        for slot, value, std in zip(
+            estimate.model.slots(), np.asarray(estimate.model.vector()), estimate.std, strict=True
+        )
+    )
+
+
+def _shapes_held(model: GyroModel, found: Sequence[Found]) -> GyroModel:
+    """The model with shapes at their searched values; an effect without a free coefficient keeps its last one free."""
+    held = set()
+    for effect in (f.effect for f in found if f.effect is not None):
+        linear = {name for name, declared in effect.declared().items() if declared.linear}
+        shapes = [name for name in effect.declared() if name not in linear]
+        held |= {(effect.label, name) for name in (shapes if linear - set(effect.held) else shapes[:-1])}
+    return replace(model, fixed=model.fixed | frozenset(held))
