@@ -90,7 +90,8 @@ def _matching(pattern: Path) -> list[Path]:
     place = pattern.parts.index("**")
     tops, rest = _matching(Path(*pattern.parts[:place])), pattern.parts[place + 1 :] or ("*",)
     folders = [folder for top in tops for folder, _, _ in _walked(top)]
-    return [path for folder in folders for path in _matching(Path(glob.escape(folder), *rest))]
+    found = [path for folder in folders for path in _matching(Path(glob.escape(folder), *rest))]
+    return [path for path in found if is_zarr(path) or not path.is_dir()]
 
 
 def _walked(root: Path) -> Iterator[tuple[str, list[str], list[str]]]:
