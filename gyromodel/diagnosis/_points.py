@@ -48,11 +48,9 @@ def dwells_apart(estimate: Estimate, unit: str) -> str | None:
         return None
     first = [(np.flatnonzero(number == k)[0], away[k]) for k in apart[:DWELLS_TOLD]]
     told = ", ".join(f"{d:+.3g} {unit} at {keys[0][r] * factor('rad/s', 'deg/s'):.4g} deg/s" for r, d in first)
+    why = "" if estimate.noise_given else " estimated noise takes that for its own;"
     some = "The mean of one dwell stands" if len(apart) == 1 else f"The means of {len(apart)} dwells stand"
-    return (
-        f"{some} apart from all others ({told}{', …' if len(apart) > DWELLS_TOLD else ''}): estimated noise takes that "
-        "for its own; repeat these rates."
-    )
+    return f"{some} apart from all others ({told}{', …' if len(apart) > DWELLS_TOLD else ''}):{why} repeat these rates."
 
 
 def explained_by(left: np.ndarray, y: np.ndarray, chosen: np.ndarray) -> float:
