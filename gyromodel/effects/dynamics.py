@@ -223,7 +223,7 @@ def lag(
 ) -> Float[Array, " sample"]:
     """Output less input of a first-order lag, which begins each stretch behind as it would under constant acceleration.
 
-    d = y − ω follows τ dd/dt + d = −τ dω/dt; between samples dω/dt is a straight line.
+    d = y − ω follows τ dd/dt + d = −τ dω/dt; between samples dω/dt is a parabola.
     """
     clock, first, _ = _clock(time)
     begins = first == jnp.arange(len(time))
@@ -232,10 +232,13 @@ def lag(
     steady = -time_constant * rising
     # d = −τ dω/dt + τ² d²ω/dt² − …, which only small time constants can take from so few samples.
     known = jnp.exp(-((time_constant / (CONTINUED * _usual(time))) ** 2))
-    start = steady + known * time_constant**2 * slope(time, rising)
+    bending = slope(time, rising)
+    start = steady + known * time_constant**2 * bending
     decay, ratio = jnp.exp(-step / time_constant), time_constant / step
     mean = ratio * (1.0 - decay)
     drive = (1.0 - mean) * steady + (mean - decay) * jnp.concatenate([steady[:1], steady[:-1]])
+    # A straight line less ½ d³ω/dt³ s(h − s) at s in a step h.
+    drive += 0.5 * time_constant**2 * (1.0 + decay - 2.0 * mean) * jnp.diff(bending, prepend=bending[:1])
     decay, drive = jnp.where(begins, 0.0, decay), jnp.where(begins, start, drive)
 
     def follow(d, now):
