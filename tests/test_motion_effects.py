@@ -294,6 +294,7 @@ def late(delay: float) -> Callable[[np.ndarray, float], np.ndarray]:
     return response
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "size", "response"),
     [
@@ -318,8 +319,9 @@ def test_a_rate_is_followed_between_gaps() -> None:
     within = np.arange(50) * 0.01
     time = np.concatenate([within + 60.0 * i for i in range(4)])
     rate = np.concatenate([offset + 10.0 * np.sin(6.0 * within) for offset in (0.0, 40.0, -50.0, 30.0)])
-    assert Bandwidth.candidates({"time": time, "rate": rate})
-    assert TimeDelay.candidates({"time": time, "rate": rate})
+    signals = {"time": jnp.asarray(time), "rate": jnp.asarray(rate)}
+    assert Bandwidth.candidates(signals)
+    assert TimeDelay.candidates(signals)
 
 
 @pytest.mark.long

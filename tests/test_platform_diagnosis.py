@@ -98,6 +98,7 @@ def test_a_large_delay_is_no_slope(seed: int):
     assert delay == pytest.approx(60.0, abs=5 * std)
 
 
+@pytest.mark.long
 def test_friction_that_sticks_has_no_other_name(seed: int):
     """What the redundant gimbal sticks by follows the motion as tilts, encoders and delays do."""
     diagnosis = found(sticking(seed))

@@ -161,6 +161,7 @@ def test_the_readme_prints_what_the_command_does(demo: VibrationTest, capsys: py
         assert with_uncertainty(series[name].value, series[name].std, series[name].unit) in readme
 
 
+@pytest.mark.long
 def test_one_axis_at_two_frequencies_tells_less():
     """Untested axes have no numbers; the explanations that are left are set apart by the test that is named."""
     log = read_campaign(LOG)

@@ -23,6 +23,8 @@ MARKOV_LEAD = 5.0
 INTERVAL_LEVELS, FINER_LEVELS = 10, 41
 # Half the 95 % point of chi-squared with one degree of freedom.
 REJECTED = 1.92
+# So many times it: no part of any interval.
+HOPELESS = 6.0
 
 
 def best_ratios(
@@ -112,13 +114,16 @@ def with_noise_intervals(estimate: Estimate) -> Estimate:
         np.union1d(np.unique(r)[::2], float(b) * np.array([0.2, 1.0, 5.0]))
         for r, b in zip(grid, estimate.ratios, strict=True)
     ]
-    for margin in (4.0, 2.0, 2.0, 2.0, 0.0):
+    for turn, margin in enumerate((4.0, 2.0, 2.0, 2.0, 0.0)):
         result = restricted_likelihood(_mesh(levels), record.interval, span, record.sampling, jacobian, residual)
         below = result.log_likelihood.max() - result.log_likelihood
-        if not margin or np.sum(below < REJECTED) > 2 * INTERVAL_LEVELS:
+        # Only levels even in amplitude are for splines.
+        if not margin or (turn and np.sum(below < REJECTED) > 2 * INTERVAL_LEVELS):
             break
         levels = [_levels(np.asarray(r), below < margin * REJECTED) for r in _mesh(levels)]
-    finer, (log_likelihood, log_sum) = _finer(levels, result.log_likelihood, np.log(result.residual_sum))
+    # A likelihood that falls off steeply would make splines swing where it does not.
+    likely = np.maximum(result.log_likelihood, result.log_likelihood.max() - HOPELESS * REJECTED)
+    finer, (log_likelihood, log_sum) = _finer(levels, likely, np.log(result.residual_sum))
     kept = log_likelihood.max() - log_likelihood < REJECTED
     white = np.exp(log_sum[kept]) / result.degrees_of_freedom
     ratios = _mesh(finer).take(kept)
