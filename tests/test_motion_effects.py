@@ -310,8 +310,7 @@ def test_a_strong_response_has_its_own_name_and_no_line_or_warm_up(name: str, si
     assert found.causes[0].effect == name
     assert not {"bias_periodic", "bias_warmup", "bias_step"} & {c.effect for c in found.causes}
     told = {p.name: p for p in found.causes[0].parameters}["delay" if name == "time_delay" else "time_constant"]
-    # A lag takes the rate for straight between samples: with 33 of them a period it errs by 0.3 %.
-    assert told.value == pytest.approx(size, rel=0.02)
+    assert told.value == pytest.approx(size, rel=0.005)
 
 
 def test_a_rate_is_followed_between_gaps() -> None:
