@@ -130,7 +130,8 @@ class GyroModel(eqx.Module):
     def prepared(self, signals: Signals) -> GyroModel:
         """Reference points and start values that depend on the campaign filled in."""
         self.check_columns(signals)
-        effects = tuple(e.prepared(signals) for e in self.effects)
+        # Asked of the class: equinox would make an object for each method of an effect, ten times the work of most.
+        effects = tuple(type(e).prepared(e, signals) for e in self.effects)
         if all(a is b for a, b in zip(effects, self.effects, strict=True)):
             return self
         return eqx.tree_at(lambda m: m.effects, self, effects)

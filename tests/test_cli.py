@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gyromodel import _cache, _console, cli
+from gyromodel import _compiling, _console, cli
 from gyromodel.campaign import Campaign
 from gyromodel.files import read_campaign, write_campaign
 
@@ -574,7 +574,7 @@ def test_compiled_code_is_kept_where_that_is_possible(tmp_path: Path, monkeypatc
     def kept(home: Path) -> str | None:
         monkeypatch.setenv("XDG_CACHE_HOME", str(home))
         monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
-        _cache.keep_compiled()
+        _compiling.keep_compiled()
         return os.environ.get("JAX_COMPILATION_CACHE_DIR")
 
     monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
@@ -585,8 +585,22 @@ def test_compiled_code_is_kept_where_that_is_possible(tmp_path: Path, monkeypatc
     assert kept(tmp_path / "file") is None
     # What the user has set stays.
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "mine")
-    _cache.keep_compiled()
+    _compiling.keep_compiled()
     assert os.environ["JAX_COMPILATION_CACHE_DIR"] == "mine"
+
+
+def test_the_compiler_gets_switches_that_it_knows_only(monkeypatch: pytest.MonkeyPatch):
+    def switches(jaxlib: str) -> str:
+        monkeypatch.setattr(_compiling, "version", lambda name: {"jaxlib": jaxlib}[name])
+        monkeypatch.delenv("XLA_FLAGS", raising=False)
+        _compiling.take_former_fusions()
+        return os.environ["XLA_FLAGS"]
+
+    assert switches("0.10.2") == "--xla_cpu_use_fusion_emitters=false"
+    assert switches("0.10.3") == switches("0.11.0") == ""
+    monkeypatch.setenv("XLA_FLAGS", "mine")
+    _compiling.take_former_fusions()
+    assert os.environ["XLA_FLAGS"] == "mine"
 
 
 def test_json_has_null_where_there_is_no_number():

@@ -52,10 +52,14 @@ def gram_and_roughness(
     """
     free = _free(model)
 
+    present = data.weight > 0
+
     def rows_of(effect: Effect, names: tuple[str, ...]) -> Rows:
+        """Zero where there is no sample, and what is read there may not be a number."""
         if effect.remembers:  # it looks at neighbouring samples, and must see all of them
             whole = {name: values.ravel() for name, values in data.signals.items()}
-            return jax.tree.map(_in_blocks, _rows(effect, whole, names))
+            rows = jax.tree.map(_in_blocks, _rows(effect, whole, names))
+            return jax.tree.map(lambda values: jnp.where(present[:, None], values, 0.0), rows)
         return _over_blocks(lambda part: _rows(effect, part, names), data)
 
     steady = {
@@ -80,10 +84,8 @@ def gram_and_roughness(
             state, total = carry
             part = jax.tree.map(lambda values: values[block], (data.signals, data.weight, known, data.filter))
             signals, weight, rows, filter = part
-            stacked = _stacked(now, signals, rows, free)
-            if filter is None:
-                stacked = jnp.where(weight > 0, stacked * weight, 0.0)
-            else:
+            stacked = _stacked(now, signals, rows, free, weight if filter is None else jnp.sign(weight))
+            if filter is not None:
                 state, white = whiten_on(state, filter, stacked.T)
                 stacked = white.T
             return state, total + stacked @ stacked.T
@@ -99,7 +101,7 @@ def gram_and_roughness(
 
         def add(block, carry):
             signals, weight, rows = jax.tree.map(lambda values: values[block], (data.signals, data.weight, known))
-            change = jnp.diff(weight * jnp.where(weight > 0, _stacked(now, signals, rows, free)[-1], 0.0))
+            change = jnp.diff(_stacked(now, signals, rows, free, weight)[-1])
             both = (weight[1:] > 0) & (weight[:-1] > 0)
             return carry[0] + jnp.sum(jnp.where(both, change, 0.0) ** 2), carry[1] + both.sum()
 
@@ -116,7 +118,9 @@ def _over_blocks(rows: Callable[[Signals], Rows], data: Blocks) -> Rows:
 
     def put(block, found):
         part = rows({name: values[block] for name, values in data.signals.items()})
-        return jax.tree.map(lambda all, one: all.at[block].set(one), found, part)
+        return jax.tree.map(
+            lambda all, one: all.at[block].set(jnp.where(data.weight[block] > 0, one, 0.0)), found, part
+        )
 
     return jax.lax.fori_loop(0, data.used, put, jax.tree.map(lambda s: jnp.zeros((blocks, *s.shape), s.dtype), shapes))
 
@@ -153,9 +157,16 @@ def _rows(effect: Effect, signals: Signals, free: tuple[str, ...]) -> Rows:
 
 
 def _stacked(
-    model: GyroModel, signals: Signals, known: Mapping[int, Rows], free: Mapping[int, tuple[str, ...]]
+    model: GyroModel,
+    signals: Signals,
+    known: Mapping[int, Rows],
+    free: Mapping[int, tuple[str, ...]],
+    weight: Float[Array, " sample"],
 ) -> Float[Array, "row sample"]:
-    """The derivative of the output by each free parameter, and last predicted minus measured output."""
+    """The derivative of the output by each free parameter, and last predicted minus measured output, weighted.
+
+    The weight goes into what each row is multiplied by anyway; where it is zero, so is what rows have not set to zero.
+    """
     rate = signals.get("rate", jnp.zeros_like(signals["time"]))
     scale = jnp.ones_like(rate)
     for i, effect in enumerate(model.effects):
@@ -163,19 +174,20 @@ def _stacked(
             continue
         term = effect.linear() @ known[i][0]
         rate, scale = (rate + term, scale) if effect.site == "rate" else (rate, scale + term)
-    gain = model.gain()
-    prediction = gain * rate * scale
+    by_rate, by_scale = (jnp.where(weight > 0, weight * model.gain() * v, 0.0) for v in (scale, rate))
+    prediction = by_scale * scale
     stacked = []
     for i, names in free.items():
         effect = model.effects[i]
         if effect.site == "gain":
             stacked.append((prediction / effect.value)[None])  # type: ignore[attr-defined]
             continue
-        by = gain * scale if effect.site == "rate" else gain * rate
+        by = by_rate if effect.site == "rate" else by_scale
         for name in names:
             linear = effect.declared()[name].linear
             alike = [k for k, d in effect.declared().items() if d.linear == linear and (linear or k in names)]
             start = sum(np.size(getattr(effect, k)) for k in alike[: alike.index(name)])
             part = known[i][0 if linear else 1]
             stacked.append(by * part[start : start + np.size(getattr(effect, name))])  # type: ignore[index]
-    return jnp.concatenate([*stacked, (prediction - signals["output"])[None]])
+    measured = jnp.where(weight > 0, weight * signals["output"], 0.0)
+    return jnp.concatenate([*stacked, (prediction - measured)[None]])

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from gyromodel._compiling import former_fusions
 from gyromodel.estimate._blocks import BLOCK, Blocks, gram_and_roughness
 from gyromodel.estimate._fit import check_enough, given_ratios
 from gyromodel.model import GyroModel, check_units, record_span
@@ -118,7 +120,7 @@ def _stacked(each: Sequence[Any]) -> Any:
     )
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=former_fusions())
 def search(data: SideBySide, campaign, start, most) -> tuple[Search, Float[Array, " task"]]:
     """One search after the other, each of a campaign from a start; and the white variance expected where they end."""
 
