@@ -377,9 +377,9 @@ def _page(ragged, mine, loops, alike, exact, batches, passes, compiled, by_sampl
         f"The faster of the scipy loops over `fit_many`: {_met(best[12], MUST['scipy'], True)} with 12 parameters, "
         f"{_met(best[40], MUST['scipy, 40'], True)} with 40. Peers are compiled as JAX does by "
         "default; with the switch that `fit_many` compiles with, the loop with 12 parameters (lm) takes "
-        f"{1e3 * alike['cpu']:.1f} ms: {alike['cpu'] / per_fit[12]['cpu']:.2g} times as long. optimistix under vmap, "
-        f"as it is: {_met(batches['vmap', False]['cpu'] / per_fit[12]['cpu'], MUST['stock'], True)}; given our scaling: "
-        f"{batches['vmap', True]['cpu'] / per_fit[12]['cpu']:.3g}.",
+        f"{1e3 * alike['cpu']:.1f} ms: {alike['cpu'] / per_fit[12]['cpu']:.2g} times as long. optimistix under "
+        f"vmap, as it is: {_met(batches['vmap', False]['cpu'] / per_fit[12]['cpu'], MUST['stock'], True)}; given our "
+        f"scaling: {batches['vmap', True]['cpu'] / per_fit[12]['cpu']:.3g}.",
         "",
         "## Same answers",
         "",
