@@ -39,6 +39,8 @@ from tests.truth.verdicts import allowed
 RESULTS = Path(__file__).parent / "results"
 # Campaigns at full scale, by what is hidden in them.
 NULLS, EFFECTS, CURVE, UNKNOWNS, PAIRS, INSEPARABLE, CALIBRATED, MUTATED = 400, 600, 200, 300, 400, 120, 200, 60
+# However small the part, so many of what is counted in few campaigns.
+FEWEST = 24
 DRAWS = 200  # of a calibration whose p-values are looked at
 # Channels that a campaign measures, of those that unknown effects follow.
 MEASURED = ("temperature", "rate", "supply_voltage", "pressure")
@@ -158,11 +160,12 @@ def _leak(records: list[study.Record], size: float) -> str:
 
 
 def _mutants(
-    run: Run, nulls: list[study.Case], effects: list[study.Case]
+    run: Run, nulls: list[study.Case], effects: list[study.Case], more: list[study.Case]
 ) -> tuple[list[str], list[str], list[study.Record]]:
     """Rows 1, 5 and 15 with a safeguard off, beside the same campaigns with it on.
 
-    Returns the table, the checks that each row is broken, and the campaigns whose best candidate was added by force.
+    `more` campaigns with nothing hidden are for what one campaign hardly shows. Returns the table, the checks that each
+    row is broken, and the campaigns whose best candidate was added by force.
     """
     lines = ["| switched off | measure | with it | without |", "|---|---|---|---|"]
     checks, forced = [], []
@@ -173,7 +176,7 @@ def _mutants(
         measure, must, at_least, gain = {
             "1": ("extension with nothing hidden", 0.02, False, False),
             "5": ("named, 3×", 0.92, True, False),
-            "15": ("gain claimed for the best candidate, nothing hidden", 0.05, False, True),
+            "15": ("held-out score rises with the best candidate, nothing hidden", 0.5, False, True),
         }[row]
         both = []
         for name in (beside, mutant):
@@ -189,7 +192,7 @@ def _mutants(
     line("whitening", "1", nulls, "detected", "no_whitening")
     line("price of the search", "1", nulls, "detected", "no_look_elsewhere")
     line("projection", "5", effects, "named", "no_projection")
-    forced = line("nesting", "15", nulls, "gain_claimed", "forced_no_nesting", "forced")
+    forced = line("nesting", "15", more, "gain_shown", "forced_no_nesting", "forced")
     return lines, checks, forced
 
 
@@ -337,6 +340,9 @@ def main(argv: list[str] | None = None) -> None:
     def many(count: int) -> int:
         return max(round(count * args.scale), 6)
 
+    def few(count: int) -> int:
+        return max(many(count), FEWEST)
+
     def run(label: str, cases: list[study.Case], **options: Any) -> list[study.Record]:
         records = study.run_cases(cases, args.workers, **options)
         print(f"{label}: {len(records)} campaigns, {time.time() - start:.0f} s", file=sys.stderr, flush=True)
@@ -362,16 +368,16 @@ def main(argv: list[str] | None = None) -> None:
         cases = study.unknown_cases(many(UNKNOWNS), seed + 20 + k, size, FAMILY)
         unknown[size] = run(f"unknown at {size:g} x MDE", cases, controls=controls if size == 3.0 else ())
     pairs = run("two causes", study.pair_cases(many(PAIRS), seed + 25, 3.0, FAMILY))
-    inseparable = run("inseparable", study.inseparable_cases(many(INSEPARABLE), seed + 30), after=True)
-    drifts = run("drifts", study.drift_cases(many(INSEPARABLE), seed + 31))
+    inseparable = run("inseparable", study.inseparable_cases(few(INSEPARABLE), seed + 30), after=True)
+    drifts = run("drifts", study.drift_cases(few(INSEPARABLE), seed + 31))
     broken = study.null_cases(many(MUTATED), seed + 40, ("flicker_and_walk",), (A, B, C))
-    mutants, mutant_checks, forced = _mutants(run, broken, study.effect_cases(many(MUTATED), seed + 41, 3.0))
-    forced += run("best candidate by force", study.null_cases(many(MUTATED), seed + 42), mutant="forced", gain=True)
+    more = study.null_cases(few(MUTATED), seed + 42)
+    mutants, mutant_checks, forced = _mutants(run, broken, study.effect_cases(many(MUTATED), seed + 41, 3.0), more)
     seconds = _timed(seed + 70)
 
     study_ = Study(
         nulls, outside, calibrated, sized, unknown, pairs, inseparable, drifts, forced,
-        (mutants, mutant_checks), seconds, 2 * 4 * len(broken),
+        (mutants, mutant_checks), seconds, 2 * 3 * len(broken) + len(more),
     )  # fmt: skip
     _write(args, sys.argv[1:] if argv is None else argv, study_)
 

@@ -79,7 +79,8 @@ class Score:
     called_unknown: bool
     first_right: bool
     driver_right: bool
-    gain_claimed: bool
+    gain_claimed: bool  # its interval is above zero
+    gain_shown: bool
 
 
 def allowed(truth: str, design: str) -> tuple[frozenset[str], bool]:
@@ -119,4 +120,5 @@ def judge(truth: Truth, design: str, answer: Answer, isolable: bool = True) -> S
         first_right=answer.first in ours,
         driver_right=driver_right,
         gain_claimed=answer.gain_score[1] > 0,
+        gain_shown=answer.gain_score[0] > 0,
     )
