@@ -68,6 +68,22 @@ class Record(NamedTuple):
         """Real rows with an output."""
         return np.asarray(self.sampling.present)[: self.rows]
 
+    @property
+    def run(self) -> np.ndarray:
+        """Each sample's run, counted from 0; padding belongs to the last."""
+        return np.cumsum(np.asarray(self.sampling.restart)) - 1
+
+    @property
+    def run_numbers(self) -> tuple[int, ...]:
+        """Of each run the number in `campaign`, by which effects know it: 0 where there is one run; none without."""
+        run = self.run[: self.rows]
+        if run[-1] == 0:
+            return (0,)
+        number = np.asarray(self.signals.get("campaign", np.zeros(len(self.run))))[: self.rows]
+        first = number[np.unique(run, return_index=True)[1]]
+        alone = len(np.unique(first)) == len(first) and (number == first[run]).all()
+        return tuple(map(int, first)) if alone and np.isin(first, range(1, 100)).all() else ()
+
     def without(self, rows: np.ndarray) -> Record:
         """The same record with some rows treated as missing."""
         drop = np.zeros(len(self.sampling.present), bool)

@@ -54,17 +54,27 @@ def static_log(rng: np.random.Generator, wrong: np.ndarray | float = 0.0, unit: 
     return gm.Campaign(columns, units, {"kind": "rate"})
 
 
-def dense_covariance(ratios: NoiseRatios, interval: float, span: float, time: np.ndarray) -> np.ndarray:
+def dense_covariance(
+    ratios: NoiseRatios, interval: float, span: float, time: np.ndarray, run: np.ndarray
+) -> np.ndarray:
     noise = markov_sum(ratios, interval, span)
     apart = np.abs(time[:, None] - time)
-    v = np.eye(len(time)) + float(noise.variance[0]) * np.minimum(time[:, None], time)
+    v = float(noise.variance[0]) * np.minimum(time[:, None], time)
     for decay, variance in zip(np.asarray(noise.decay[1:]), np.asarray(noise.variance[1:]), strict=True):
         v += variance * np.exp(-decay * apart)
-    return v
+    return np.eye(len(time)) + v * (run[:, None] == run)
 
 
-def test_search_statistics_equal_dense_algebra(rng: np.random.Generator) -> None:
-    record = read_signals(static_log(rng))
+@pytest.mark.parametrize("lengths", [(ROWS,), (ROWS // 2, 50, ROWS - 30)])
+def test_search_statistics_equal_dense_algebra(rng: np.random.Generator, lengths: tuple[int, ...]) -> None:
+    logs = [static_log(rng) for _ in lengths]
+    record = read_signals(
+        [
+            gm.Campaign({k: v[:n] for k, v in log.columns.items()}, log.units, log.metadata)
+            for log, n in zip(logs, lengths, strict=True)
+        ]
+    )
+    rows, run = sum(lengths), np.repeat(np.arange(len(lengths)), lengths)
     span = record_span(record)
     ratios = NoiseRatios(jnp.array([0.05]), jnp.array([0.01]))
     grid = NoiseGrid(ratios, np.zeros(1), record.interval, span)
@@ -75,12 +85,12 @@ def test_search_statistics_equal_dense_algebra(rng: np.random.Generator) -> None
     ranking = rank(scanner, [0], baseline, (), set())
     result = ranking.results[0]
 
-    time = np.asarray(record.signals["time"])[:ROWS]
+    time = np.asarray(record.signals["time"])[:rows]
     inverse = np.linalg.inv(
-        dense_covariance(NoiseRatios(ratios.flicker[0], ratios.walk[0]), record.interval, span, time)
+        dense_covariance(NoiseRatios(ratios.flicker[0], ratios.walk[0]), record.interval, span, time, run)
     )
-    y = np.asarray(record.signals["output"])[:ROWS]
-    ones = np.ones((ROWS, 1))
+    y = np.asarray(record.signals["output"])[:rows]
+    ones = np.ones((rows, 1))
 
     def rss(columns: np.ndarray) -> float:
         gram = columns.T @ inverse @ columns
@@ -92,20 +102,21 @@ def test_search_statistics_equal_dense_algebra(rng: np.random.Generator) -> None
     for name, (form, explained, _) in result.best.items():
         if name == "outliers":
             assert isinstance(form, tuple)
-            column = np.eye(ROWS)[:, form[:1]]
+            column = np.eye(rows)[:, form[:1]]
         elif isinstance(form, tuple):
             pytest.fail(f"{name} has {form}")
         elif name == "bias_step":
-            column = (np.arange(ROWS) >= form)[:, None].astype(float)
+            column = ((np.arange(rows) >= form) & (run == run[form]))[:, None].astype(float)
         elif name == "bias_periodic":
             assert scanner.lines is not None
-            phase = 2 * np.pi * scanner.lines.frequencies[form] * time
-            column = np.stack([np.cos(phase), np.sin(phase)], axis=1)
+            line = scanner.lines.line(form)
+            phase, here = 2 * np.pi * line.frequency * time, run == max(line.campaign - 1, 0)
+            column = np.stack([here * np.cos(phase), here * np.sin(phase)], axis=1)
         else:
             block = scanner.bank.blocks[form]
             if block.width > 6:
                 continue
-            column = scanner.bank.columns[:ROWS, block.start : block.start + block.width]
+            column = scanner.bank.columns[:rows, block.start : block.start + block.width]
         # A line's energy is interpolated over frequency next to the leading peaks.
         close = 0.1 if name == "bias_periodic" else 1e-5
         assert explained == pytest.approx(null - rss(np.hstack([ones, column])), rel=close, abs=1e-9 * null), name
@@ -118,9 +129,9 @@ def test_search_statistics_equal_dense_algebra(rng: np.random.Generator) -> None
     price = np.log((len(best) - 1) / 2)
     together = {}
     for one, other in combinations(best, 2):
-        columns = [scanner.bank.columns[:ROWS, b.start : b.start + b.width] for b in (best[one], best[other])]
+        columns = [scanner.bank.columns[:rows, b.start : b.start + b.width] for b in (best[one], best[other])]
         t, q = null - rss(np.hstack([ones, *columns])), best[one].width + best[other].width
-        ratio = log_evidence_ratio(np.array(t), null, ROWS - 1, q)
+        ratio = log_evidence_ratio(np.array(t), null, rows - 1, q)
         together[frozenset((one, other))] = float(ratio) - price - np.log(forms[one] * forms[other])
     pair, score = best_pair(scanner, ranking)
     assert pair

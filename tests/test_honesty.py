@@ -12,7 +12,7 @@ import gyromodel as gm
 from gyromodel.averages import average
 from gyromodel.diagnosis._isolation import settling_test
 from gyromodel.diagnosis._points import dwells_apart
-from gyromodel.effects.drivers import BiasColumn
+from gyromodel.effects.drivers import BiasColumn, BiasPeriodic, BiasStep
 from gyromodel.model import ModelError
 from gyromodel.model_files import read_model, write_model
 from gyromodel.signals import rate_output, read_signals
@@ -128,7 +128,46 @@ def test_a_bias_that_differs_between_campaigns_is_a_turn_on_bias(rng: np.random.
     found = gm.diagnose(runs, gm.model_from_effects(["bias"]), hold_out=False)
     assert (found.verdict, found.causes[0].effect) == ("named", "bias_turn_on")
     assert found.causes[0].parameters[0].value == pytest.approx(5.0, abs=4 * found.causes[0].parameters[0].std)
-    # Steps and lines are not searched across runs, and that is said.
+
+
+def test_lines_have_a_phase_of_their_own_in_each_campaign(rng: np.random.Generator) -> None:
+    frequency, phases = 12.37 / TIME[-1], rng.uniform(0, 2 * np.pi, 3)  # off the grid of frequencies
+    runs = [campaign(np.sin(2 * np.pi * frequency * TIME + phase) + rng.normal(size=ROWS)) for phase in phases]
+    found = gm.diagnose(runs, gm.model_from_effects(["bias"]), hold_out=False)
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["bias_periodic"])
+    lines = found.extended.model.effects[-1]
+    assert isinstance(lines, BiasPeriodic)
+    assert lines.campaigns == (1, 2, 3)
+    assert any("in campaigns 1, 2, 3" in line for line in found.findings)
+    sizes = {row.name: row for row in found.extended.table()}
+    for k, phase in enumerate(phases):
+        for name, truth in (("cosine", np.sin(phase)), ("sine", np.cos(phase)), ("frequency", frequency)):
+            row = sizes[f"{name}[{k}]"]
+            assert row.value == pytest.approx(truth, abs=5 * row.std), (name, k)
+
+
+def test_a_step_is_in_one_of_several_campaigns(rng: np.random.Generator, tmp_path) -> None:
+    runs = [campaign(rng.normal(size=ROWS)) for _ in range(3)]
+    late = 3.0 * (TIME[ROWS // 3] < TIME)
+    runs[1] = runs[1].with_column("output", runs[1].columns["output"] + late, runs[1].units["output"])
+    found = gm.diagnose(runs, gm.model_from_effects(["bias"]), hold_out=False)
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["bias_step"])
+    step = found.extended.model.effects[-1]
+    assert isinstance(step, BiasStep)
+    assert step.campaign == 2
+    assert abs(float(step.epoch) - TIME[ROWS // 3]) < 30.0
+    size = found.causes[0].parameters[0]
+    assert size.value == pytest.approx(3.0, abs=5 * size.std)
+    # The model file keeps where it is.
+    write_model(found.extended, tmp_path / "model.yaml")
+    again = read_model(tmp_path / "model.yaml").effects[-1]
+    assert isinstance(again, BiasStep)
+    assert again.campaign == 2
+
+
+def test_campaigns_that_no_number_tells_apart_have_no_steps_of_their_own(rng: np.random.Generator) -> None:
+    runs = [campaign(rng.normal(size=ROWS), campaign=np.full(ROWS, 7.0)) for _ in range(2)]
+    found = gm.diagnose(runs, gm.model_from_effects(["bias"]), hold_out=False)
     assert {"bias_step", "bias_periodic"} <= set(found.not_testable)
     assert not {"bias_step", "bias_periodic"} & set(found.searched)
 

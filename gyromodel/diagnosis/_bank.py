@@ -108,8 +108,8 @@ def build_bank(record: Record) -> Bank:
         reason = _missing(kind, record, signals)
         if reason:
             not_testable[name] = reason
-        elif kind.scan and np.asarray(record.sampling.restart).sum() > 1:
-            not_testable[name] = "is searched in one run at a time: diagnose the runs one by one too"
+        elif kind.scan and not record.run_numbers:
+            not_testable[name] = "is searched in runs that a column campaign numbers from 1 to 99: here it does not"
         elif kind.scan:
             scans.append(name)
         else:

@@ -81,7 +81,7 @@ class Cells:
             (q, q, count, bank.columns[:, start : start + q * count]) for q, (_, count, start) in self._layout.items()
         ]
         if lines:
-            pairs = lines.waves(lines.exact).reshape(len(bank.columns), 2, -1).transpose(0, 2, 1)
+            pairs = lines.exact_waves().reshape(len(bank.columns), 2, -1).transpose(0, 2, 1)
             blocks.append((None, 2, len(lines.exact), pairs.reshape(len(pairs), -1)))
         self._packs = _packed(blocks)
 
@@ -123,24 +123,25 @@ class Cells:
         """CᵀV⁻¹C of every block and line, a few rows at a time."""
         whole = [np.asarray(part) for part in cell.filter]
         filters = [Filter(*(part[i : i + ROWS_TOGETHER] for part in whole)) for i in _row_starts(len(whole[0]))]
-        blocks: dict[int | None, np.ndarray] = {q: np.zeros((count, q, q)) for q, (_, count, _) in self._layout.items()}
-        blocks[None] = np.zeros((len(self._lines.exact) if self._lines else 0, 2, 2))
+        blocks = {q: np.zeros((count, q, q)) for q, (_, count, _) in self._layout.items()}
+        # Of each run, as noise starts anew there.
+        pairs = np.zeros((len(self._lines.campaigns), len(self._lines.exact), 2, 2)) if self._lines else NO_LINES
         for pack in self._packs:
             state = at_rest(cell.filter, pack.rows[0].shape[1])
-            for filter, rows in zip(filters, pack.rows, strict=True):
+            for i, filter, rows in zip(_row_starts(len(whole[0])), filters, pack.rows, strict=True):
                 state, whitened = _whiten_rows(state, filter, rows)
                 w = np.asarray(whitened)
                 for key, first, count, start in pack.parts:
-                    q = key or 2
-                    together = max(GRAM_COLUMNS // q, 1)
-                    for k in range(0, count, together):
-                        part = w[:, start + q * k : start + q * min(k + together, count)]
-                        many = part.shape[1] // q
-                        square = (part.T @ part).reshape(many, q, many, q)
-                        blocks[key][first + k : first + k + many] += square[np.arange(many), :, np.arange(many), :]
-        pairs = blocks.pop(None)
-        line = self._lines.energies(pairs[:, 0, 0], pairs[:, 1, 1], pairs[:, 0, 1]) if self._lines else NO_LINES
-        return replace(cell, blocks=blocks, line=line)
+                    if key is not None:
+                        _add_squares(blocks[key][first : first + count], w[:, start : start + key * count])
+                        continue
+                    for run, here in self._lines.runs_within(i, i + len(w)) if self._lines else ():
+                        _add_squares(pairs[run, first : first + count], w[here, start : start + 2 * count])
+        if not self._lines:
+            return replace(cell, blocks=blocks, line=NO_LINES)
+        return replace(
+            cell, blocks=blocks, line=self._lines.energies(pairs[..., 0, 0], pairs[..., 1, 1], pairs[..., 0, 1])
+        )
 
     def whiten(self, g: int, columns: np.ndarray) -> np.ndarray:
         """Columns whitened in one noise cell."""
@@ -176,6 +177,17 @@ class Cells:
         z = np.ascontiguousarray(z.transpose(0, 2, 1))
         cross = self._columns.T @ z.reshape(len(z), -1)
         return z.transpose(1, 0, 2), cross.reshape(-1, len(group), columns).transpose(1, 0, 2)
+
+
+def _add_squares(total: np.ndarray, columns: np.ndarray) -> None:
+    """Add to each square block CᵀC of the columns C that belong to it."""
+    count, q = total.shape[:2]
+    together = max(GRAM_COLUMNS // q, 1)
+    for k in range(0, count, together):
+        part = columns[:, q * k : q * (k + together)]
+        many = part.shape[1] // q
+        square = (part.T @ part).reshape(many, q, many, q)
+        total[k : k + many] += square[np.arange(many), :, np.arange(many), :]
 
 
 def _row_starts(rows: int) -> range:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -9,16 +10,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from gyromodel.diagnosis._evidence import log_evidence_ratio
-from gyromodel.diagnosis._lines import RESOLVED
-from gyromodel.diagnosis._ranking import Ranking, is_noise, line_frequencies
+from gyromodel.diagnosis._lines import RESOLVED, Line, lines_of
+from gyromodel.diagnosis._ranking import Ranking, is_noise
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._tangents import Tangent
 from gyromodel.effects import Effect
 from gyromodel.effects.drivers import BiasPeriodic, BiasStep
 from gyromodel.estimate import Estimate
 from gyromodel.model import GyroModel
+from gyromodel.signals import Record
 
-# More lines than this are a spectrum that nobody explains by naming each.
+# More lines than this in each run are a spectrum that nobody explains by naming each.
 MAXIMUM_LINES = 6
 # A further line found in the same pass must exceed the leakage of stronger ones this many times.
 ABOVE_LEAKAGE = 4.0
@@ -48,9 +50,7 @@ def addition(
     effect = fixed[0] if fixed else form_effect(scanner, name, form)
     assert effect is not None
     if isinstance(effect, BiasPeriodic):
-        frequency = np.append(line_frequencies(estimate.model), _lines(scanner, ranking, estimate.model))
-        none = jnp.zeros(len(frequency))
-        effect = BiasPeriodic(cosine=none, sine=none, frequency=jnp.asarray(frequency))
+        effect = _periodic([*lines_of(estimate.model), *_lines(scanner, ranking, estimate.model)])
     for held in estimate.model.effects:
         effect = effect.joined(held) if held.label == effect.label and effect.label in effect.supersedes else effect
     effect = _solved(scanner, estimate, effect, ranking.best_cell(name), pulses).settled()
@@ -58,14 +58,22 @@ def addition(
     return effect, tuple(map(int, rows)) if len(rows) < MOST_UNKNOWN * scanner.present.sum() else ()
 
 
-def _lines(scanner: Scanner, ranking: Ranking, model: GyroModel) -> np.ndarray:
-    """Frequencies of the best line and of others in the same pass that stand by themselves."""
+def _periodic(lines: Sequence[Line]) -> BiasPeriodic:
+    frequencies, campaigns = zip(*sorted(lines, key=lambda line: line.campaign), strict=True)
+    none = jnp.zeros(len(lines))
+    return BiasPeriodic(
+        cosine=none, sine=none, frequency=jnp.asarray(frequencies), campaigns=campaigns if any(campaigns) else ()
+    )
+
+
+def _lines(scanner: Scanner, ranking: Ranking, model: GyroModel) -> list[Line]:
+    """The best line and others in the same pass that stand by themselves."""
     assert scanner.lines is not None
     result = ranking.results[ranking.best_cell("bias_periodic")]
     form, explained, _ = result.best["bias_periodic"]
     assert isinstance(form, int)
     chosen = {form: explained}
-    count, nu = len(scanner.lines.frequencies), scanner.degrees_of_freedom
+    count, nu = len(scanner.lines.unseen), scanner.degrees_of_freedom
     for k, t in sorted(result.peaks.items(), key=lambda item: -item[1]):
         if min(abs(k - j) for j in chosen) < RESOLVED:
             continue
@@ -75,18 +83,25 @@ def _lines(scanner: Scanner, ranking: Ranking, model: GyroModel) -> np.ndarray:
         alone = float(log_evidence_ratio(np.array(t), result.rss, nu, 2)) - np.log(count)
         if alone > LINE_MARGIN and t > ABOVE_LEAKAGE * leakage:
             chosen[k] = t
-    room = max(MAXIMUM_LINES - len(line_frequencies(model)), 1)
-    return scanner.lines.frequencies[list(chosen)[:room]]
+    room = max(MAXIMUM_LINES * scanner.runs - len(lines_of(model)), 1)
+    return [scanner.lines.line(k) for k in list(chosen)[:room]]
+
+
+def step_at(record: Record, row: int) -> BiasStep:
+    """A step just before a sample."""
+    time = np.asarray(record.signals["time"])
+    return BiasStep(
+        epoch=jnp.asarray(float(time[row] + time[row - 1]) / 2), campaign=record.run_numbers[record.run[row]]
+    )
 
 
 def form_effect(scanner: Scanner, name: str, form: int) -> Effect | None:
     """The effect behind a form number."""
     if name == "bias_step":
-        time = np.asarray(scanner.record.signals["time"])
-        return BiasStep(epoch=jnp.asarray(float(time[form] + time[form - 1]) / 2))
+        return step_at(scanner.record, form)
     if name == "bias_periodic":
         assert scanner.lines is not None
-        return BiasPeriodic(frequency=jnp.asarray(scanner.lines.frequencies[[form]]))
+        return _periodic([scanner.lines.line(form)])
     return scanner.bank.blocks[form].effect
 
 

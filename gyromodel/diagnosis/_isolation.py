@@ -14,10 +14,11 @@ from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._added_tests import added_tests
 from gyromodel.diagnosis._bank import PART_OF, build_bank
 from gyromodel.diagnosis._evidence import SAFE_THRESHOLD, explained_for
+from gyromodel.diagnosis._forms import step_at
 from gyromodel.diagnosis._ranking import skipped
+from gyromodel.diagnosis._scan import epochs_of
 from gyromodel.effects import CATALOGUE, Effect, Signals
 from gyromodel.effects._base import evaluate
-from gyromodel.effects.drivers import BiasStep
 from gyromodel.estimate import Estimate, filter_of, given_ratios, whiten_columns
 from gyromodel.model import GyroModel, ModelError, effect_class, make_effect, parameter_unit
 from gyromodel.noise import NoiseRatios
@@ -272,8 +273,9 @@ def _sizes(
         if block.effect is not None and block.name not in have:
             forms.setdefault(block.name, []).append(block.effect)
     if "bias_step" in bank.scans:
-        epochs = np.quantile(np.asarray(record.signals["time"])[: record.rows], np.linspace(0, 1, STEPS + 2)[1:-1])
-        forms["bias_step"] = [BiasStep(epoch=jnp.asarray(t)) for t in epochs]
+        epochs, _ = epochs_of(record)
+        chosen = epochs[np.linspace(0, len(epochs) - 1, STEPS + 2).astype(int)[1:-1]]
+        forms["bias_step"] = [step_at(record, int(row)) for row in chosen]
     left = {name: view.columns_of(effects) for name, effects in forms.items()}
     whole = {name: view.columns_of(effects, whole=True) for name, effects in forms.items()}
     not_testable = {name.removeprefix(PART_OF): reason for name, reason in bank.not_testable.items()}

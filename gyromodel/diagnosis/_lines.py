@@ -1,14 +1,20 @@
-"""Lines at every frequency: the grid that is searched, and the energy of a cosine and sine in coloured noise."""
+"""Lines at every frequency: the grid that is searched, and the energy of a cosine and sine in coloured noise.
+
+Of several runs each has lines of its own, as every start has its own phase: line k is number k mod F of the F
+frequencies, in run k div F.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 import scipy.fft
 
-from gyromodel.model import record_span
+from gyromodel.effects.drivers import BiasPeriodic
+from gyromodel.model import GyroModel, record_span
 from gyromodel.signals import Record
 
 # A line's energy is computed exactly at the lowest frequencies, at log-spaced ones to interpolate between, and at the
@@ -20,12 +26,29 @@ RESOLVED = 4
 FEWEST_CYCLES = 1.5
 
 
+class Line(NamedTuple):
+    """A line's frequency (Hz), and the campaign that it is in; 0: all."""
+
+    frequency: float
+    campaign: int
+
+
+def lines_of(model: GyroModel) -> list[Line]:
+    """The lines that a model has."""
+    effects = [e for e in model.effects if isinstance(e, BiasPeriodic)]
+    each = [(np.ravel(e.frequency), e.campaigns or (0,) * np.size(e.frequency)) for e in effects]
+    return [Line(float(f), c) for frequencies, campaigns in each for f, c in zip(frequencies, campaigns, strict=True)]
+
+
 @dataclass
 class LineGrid:
     """Frequencies searched for lines (Hz) and the Fourier grid that serves them.
 
     Attributes:
-        frequencies: searched, ascending.
+        frequencies: searched in each run, ascending.
+        run: of each sample, from 0.
+        campaigns: by which effects know each run.
+        unseen: of each line, whether its run has too few cycles of it, or samples a cycle.
         index: each sample's place on a regular grid of times.
         length: of the Fourier transform.
         first: its bin at the first frequency.
@@ -34,34 +57,64 @@ class LineGrid:
     """
 
     frequencies: np.ndarray
+    run: np.ndarray
+    campaigns: tuple[int, ...]
+    unseen: np.ndarray
     index: np.ndarray
     length: int
     first: int
     exact: np.ndarray
     turn: tuple[np.ndarray, np.ndarray] = field(repr=False)
 
+    def line(self, k: int) -> Line:
+        """Line number k."""
+        run, i = divmod(k, len(self.frequencies))
+        return Line(float(self.frequencies[i]), self.campaigns[run])
+
+    def runs_within(self, first: int, last: int) -> list[tuple[int, slice]]:
+        """The runs that some rows belong to, each with its part of them."""
+        numbers, starts = np.unique(self.run[first:last], return_index=True)
+        return [(int(n), slice(a, b)) for n, a, b in zip(numbers, starts, [*starts[1:], last - first], strict=True)]
+
+    def exact_waves(self) -> np.ndarray:
+        """Cosines, then sines, of the exact frequencies, in all runs."""
+        return self._waves(self.exact)
+
     def waves(self, which: np.ndarray) -> np.ndarray:
-        """Cosines, then sines, of some frequencies by number."""
+        """Cosines, then sines, of some lines by number."""
+        run, i = np.divmod(which, len(self.frequencies))
+        return self._waves(i) * np.tile(self.run[:, None] == run, 2)
+
+    def _waves(self, which: np.ndarray) -> np.ndarray:
         phase = self.index[:, None] * (self.first + which) % self.length
         return np.concatenate([part[phase] for part in self.turn], axis=1)
 
     def spectrum(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Inner products of columns with the cosine and with the sine of every frequency."""
-        spread = np.stack([np.bincount(self.index, column, self.length) for column in columns.T])
+        """Inner products of columns with the cosine and with the sine of every line."""
         here = slice(self.first, self.first + len(self.frequencies))
-        found = np.asarray(scipy.fft.rfft(spread, axis=1))[:, here].T
-        return np.real(found), -np.imag(found)
+        found = []
+        for _, rows in self.runs_within(0, len(columns)):
+            spread = np.stack([np.bincount(self.index[rows], column[rows], self.length) for column in columns.T])
+            found.append(np.asarray(scipy.fft.rfft(spread, axis=1))[:, here].T)
+        both = np.concatenate(found)
+        return np.real(both), -np.imag(both)
 
-    def unresolved(self, lines: np.ndarray) -> np.ndarray:
-        """Which frequencies the record cannot resolve from any of some lines (Hz)."""
-        near = np.abs(self.frequencies[:, None] - lines) < RESOLVED * (self.frequencies[1] - self.frequencies[0])
-        return np.asarray(near.any(axis=1))
+    def barred(self, lines: Sequence[Line]) -> np.ndarray:
+        """Which lines their run does not show, or does not resolve from any of some lines."""
+        near, barred = RESOLVED * (self.frequencies[1] - self.frequencies[0]), self.unseen
+        for line in lines:
+            there = np.isin(self.campaigns, line.campaign) if line.campaign else np.ones(len(self.campaigns), bool)
+            barred = barred | np.outer(there, np.abs(self.frequencies - line.frequency) < near).ravel()
+        return barred
 
     def energies(self, cosine: np.ndarray, sine: np.ndarray, cross: np.ndarray) -> np.ndarray:
-        """2×2 energies at every frequency from those of the exact ones, each interpolated between.
+        """2×2 energies of every line from those of the exact ones (one axis more: run), each interpolated between.
 
         Cosine and sine differ at every frequency where the noise walks: the cosine begins with a jump.
         """
+        return np.concatenate([self._energies(*one) for one in zip(cosine, sine, cross, strict=True)])
+
+    def _energies(self, cosine: np.ndarray, sine: np.ndarray, cross: np.ndarray) -> np.ndarray:
         x, at = np.log(self.frequencies), np.log(self.frequencies[self.exact])
         squares = [np.maximum(e, 1e-300) for e in (cosine, sine)]
         cc, ss = (np.exp(np.interp(x, at, np.log(e))) for e in squares)
@@ -87,4 +140,19 @@ def line_grid(record: Record) -> LineGrid:
     exact = np.unique(np.concatenate([exact, np.clip(spaced, 0, len(frequencies) - 1)]))
     index = np.minimum(np.round(time / grid).astype(int), length - 1)
     angle = 2.0 * np.pi * np.arange(length) / length
-    return LineGrid(frequencies, index, length, first, exact, (np.cos(angle), np.sin(angle)))
+    run = record.run
+    unseen = []
+    for own in (time[: record.rows][run[: record.rows] == r] for r in range(run[-1] + 1)):
+        slow = frequencies * (np.ptp(own) + 1e-9 * span) < FEWEST_CYCLES
+        unseen += [slow | (frequencies > 0.5 / np.median(np.diff(own))) if len(own) > 1 else slow]
+    return LineGrid(
+        frequencies,
+        run,
+        record.run_numbers,
+        np.concatenate(unseen),
+        index,
+        length,
+        first,
+        exact,
+        (np.cos(angle), np.sin(angle)),
+    )

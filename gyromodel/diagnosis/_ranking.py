@@ -11,11 +11,12 @@ import numpy as np
 from gyromodel._checks import thermometers
 from gyromodel.diagnosis._drivers import RESPONSE_DRIVER
 from gyromodel.diagnosis._evidence import log_sum
+from gyromodel.diagnosis._lines import lines_of
 from gyromodel.diagnosis._scan import CellResult, Scanner
 from gyromodel.diagnosis._tangents import Tangent
 from gyromodel.effects import CATALOGUE
 from gyromodel.effects._base import evaluate
-from gyromodel.effects.drivers import BiasColumn, BiasPeriodic
+from gyromodel.effects.drivers import BiasColumn
 from gyromodel.estimate import Estimate
 from gyromodel.model import GyroModel, effect_class
 from gyromodel.noise import markov_cells, restricted_likelihood
@@ -149,7 +150,7 @@ def rank(
         columns,
         residual,
         contained,
-        line_frequencies(estimate.model),
+        lines_of(estimate.model),
         list(continued.values()),
     )
     results = {g: everything[g] for g in cells}
@@ -247,11 +248,6 @@ def noise_kinds(scanner: Scanner, ranking: Ranking) -> dict[str, float]:
     total = log_sum([v for of_kind in logs.values() for v in of_kind])
     weight = {kind: float(np.exp(log_sum(v) - total)) for kind, v in logs.items() if v}
     return dict(sorted(weight.items(), key=lambda item: -item[1]))
-
-
-def line_frequencies(model: GyroModel) -> np.ndarray:
-    """Frequencies (Hz) of the lines that a model has."""
-    return np.concatenate([np.zeros(0), *(np.ravel(e.frequency) for e in model.effects if isinstance(e, BiasPeriodic))])
 
 
 def skipped(model: GyroModel, columns: Iterable[str]) -> set[str]:

@@ -21,7 +21,7 @@ from threadpoolctl import ThreadpoolController
 from gyromodel.diagnosis._bank import Bank
 from gyromodel.diagnosis._cells import Cell, Cells, precision
 from gyromodel.diagnosis._evidence import log_evidence_ratio, log_mean, log_mean_of_parts
-from gyromodel.diagnosis._lines import PEAK_WIDTH, PEAKS, line_grid
+from gyromodel.diagnosis._lines import PEAK_WIDTH, PEAKS, Line, line_grid
 from gyromodel.diagnosis._points import explained_by, robust_order
 from gyromodel.diagnosis._tangents import VANISHED, Tangent, add_tangents
 from gyromodel.noise import NoiseGrid
@@ -34,7 +34,6 @@ LOST = 1e-6
 CLEARLY = 4.0
 # Lines whose interpolated statistic, were it this much larger, would not pay for the search are left interpolated.
 PEAK_SLACK = 1.5
-NO_LINES = np.zeros(0)
 # Further gross errors that are given up with the greatest: evidence of each alone (nats), the search over rows paid
 # for, and rows to the next, as errors side by side share theirs.
 ERROR_MARGIN, ERROR_DISTANCE = 8.0, 3
@@ -123,7 +122,7 @@ class Scanner:
         self._least = np.array([b.least for b in bank.blocks])
         self._price = np.array([b.price for b in bank.blocks])
         self._lost = np.zeros(len(bank.blocks), bool)
-        self.epochs = np.flatnonzero(self.present[: record.rows])[1:-1]
+        self.epochs, self._run_ends = epochs_of(record)
 
     def without(self, rows: np.ndarray, cells: list[int]) -> Scanner:
         """The same search on the record without some rows, in some of the noise cells.
@@ -136,7 +135,7 @@ class Scanner:
         whole, left = (np.sum(self.bank.columns[present] ** 2, axis=0) for present in (self.present, other.present))
         gone = np.add.reduceat((left < LOST * whole).astype(int), [b.start for b in self.bank.blocks])
         other._lost = np.array([b.kind == "effect" for b in self.bank.blocks]) & (gone > 0)
-        other.epochs = np.flatnonzero(other.present[: other.record.rows])[1:-1]
+        other.epochs, other._run_ends = epochs_of(other.record)
         other.cells, other.only_cells = self.cells.sampled(other.record.sampling), cells
         return other
 
@@ -184,7 +183,7 @@ class Scanner:
         jacobian: np.ndarray,
         residual: np.ndarray,
         contained: dict[str, int],
-        lines: np.ndarray = NO_LINES,
+        lines: Sequence[Line] = (),
         tangents: Sequence[Tangent] = (),
     ) -> dict[int, CellResult]:
         """Evaluate every candidate against a baseline in the given noise cells.
@@ -194,7 +193,7 @@ class Scanner:
             jacobian: the baseline's columns, any scale.
             residual: measured minus predicted, as a rate.
             contained: how many of a candidate's columns the baseline already has, by name.
-            lines: frequencies (Hz) of the baseline's lines.
+            lines: the baseline's.
             tangents: candidates that continue effects of the baseline.
         """
         batches = self.run_many(cells, jacobian, residual[:, None], contained, lines, tangents)
@@ -206,7 +205,7 @@ class Scanner:
         jacobian: np.ndarray,
         residuals: np.ndarray,
         contained: dict[str, int],
-        lines: np.ndarray = NO_LINES,
+        lines: Sequence[Line] = (),
         tangents: Sequence[Tangent] = (),
     ) -> list[Batch]:
         """As `run`, for many residuals of one baseline at once (one a column); cells in the order given."""
@@ -217,7 +216,7 @@ class Scanner:
         stacked = np.where(self.present[:, None], stacked, 0.0)
         p, first = jacobian.shape[1], len(tangents)
         # What follows a line closely is a line that is not steady, and no other line.
-        barred = self.lines.unresolved(lines) if self.lines else np.zeros(0, bool)
+        barred = self.lines.barred(lines) if self.lines else np.zeros(0, bool)
 
         def search(group: Sequence[int]) -> list[Batch]:
             z, cross = self.cells.inner_products(group, stacked)
@@ -233,6 +232,10 @@ class Scanner:
             self.cells.prepare(cells, pool.map)
             groups = self.cells.groups(cells, stacked.shape[1])
             return [batch for group in pool.map(search, groups) for batch in group]
+
+    def _to_run_end(self, onwards: np.ndarray) -> np.ndarray:
+        """Of sums from each sample to the last, those from each epoch to the end of its run."""
+        return onwards[self.epochs] - np.concatenate([onwards, np.zeros_like(onwards[:1])])[self._run_ends]
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -256,10 +259,9 @@ class Scanner:
         zy = z[:, p:] - zj @ jy
         cross_j = cross[:, :p] @ root.T
         self._blocks(batch, cell, cross_j, cross[:, p:] - cross_j @ jy, nu, least)
-        rows = self.epochs
         if self.steps:
-            sj, sy = (np.cumsum(v[::-1], axis=0)[::-1][rows] for v in (zj, zy))
-            self._single(batch, "bias_step", rows, sy, cell.step[rows], sj, nu)
+            sj, sy = (self._to_run_end(np.cumsum(v[::-1], axis=0)[::-1]) for v in (zj, zy))
+            self._single(batch, "bias_step", self.epochs, sy, self._to_run_end(cell.step), sj, nu)
         if self.outliers:
             rows = np.flatnonzero(self.present[: self.record.rows])
             if self.by_points:
@@ -402,6 +404,14 @@ class Scanner:
         batch.evidence[name] = evidence
         batch.best[name] = (list(where[top]), best, np.full(len(top), float(q)))
         batch.energy[name] = energy
+
+
+def epochs_of(record: Record) -> tuple[np.ndarray, np.ndarray]:
+    """Samples that a step may come before, in each run all but the first and the last; and where their runs end."""
+    run, rows = record.run, np.flatnonzero(record.present)
+    parts = [part[1:-1] for part in np.split(rows, np.flatnonzero(np.diff(run[rows])) + 1)]
+    epochs = np.concatenate(parts)
+    return epochs, np.searchsorted(run, run[epochs], side="right")
 
 
 def _gross(t: np.ndarray, where: np.ndarray, rss: float, nu: int) -> list[int]:

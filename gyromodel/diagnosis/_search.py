@@ -11,8 +11,9 @@ from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._evidence import log_evidence_ratio, log_sum
 from gyromodel.diagnosis._exchange import SLOW_IN_TIME, SLOW_LEAD, exchanged, unresolved
 from gyromodel.diagnosis._forms import MAXIMUM_LINES
+from gyromodel.diagnosis._lines import lines_of
 from gyromodel.diagnosis._pairs import best_pair
-from gyromodel.diagnosis._ranking import Ranking, line_frequencies, rank, skipped
+from gyromodel.diagnosis._ranking import Ranking, rank, skipped
 from gyromodel.diagnosis._steps import EXCHANGE, Found, Steps, rows_of, standing
 from gyromodel.estimate import Estimate
 
@@ -58,7 +59,7 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
     while True:
         estimate = estimates[-1]
         ranking = steps.rank(estimate, path)
-        full = len(line_frequencies(estimate.model)) >= MAXIMUM_LINES
+        full = len(lines_of(estimate.model)) >= MAXIMUM_LINES * scanner.runs
         lines = ranking.statistic.get("bias_periodic", -np.inf)
         remains = "bias_periodic" if full and lines >= threshold else ""
         name, score = ranking.best(drivers=False, but=("bias_periodic" if full else "", "" if path else avoid))

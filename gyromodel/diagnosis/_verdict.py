@@ -19,6 +19,8 @@ from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import TIME_MARGIN, Selection, like
 from gyromodel.diagnosis._shapes import remaining, separation
 from gyromodel.diagnosis._steps import Found, Steps
+from gyromodel.effects import Effect
+from gyromodel.effects.drivers import BiasPeriodic, BiasStep
 from gyromodel.estimate import Estimate
 from gyromodel.model import effect_class
 from gyromodel.signals import Record
@@ -64,7 +66,8 @@ def credible(
     if name not in ("outliers", "bias_step", "bias_periodic") and not is_noise(name):
         # Only the number of forms and coefficients sets them apart, which is no evidence.
         own |= {k: max(own[k], own[name]) for k in ranking.twins(name) & own.keys()}
-    if runs < 2 and (hidden_by_walk or too_close):
+    # A drift comes back with the next run, and a step does not.
+    if (runs < 2 or name == "bias_step") and (hidden_by_walk or too_close):
         own["noise_random_walk"] = max(0.0, statistic - 1.0)
     top = max(own.values())
     weight = {k: float(np.exp(v - top)) for k, v in own.items()}
@@ -82,6 +85,15 @@ def credible(
             chosen[winner] += chosen.pop(loser)
     # What was added and is not among the likeliest is in doubt with them.
     return chosen if name in chosen else chosen | {name: weight[name] / total}
+
+
+def _in_campaign(effect: Effect | None) -> str:
+    """Which of several campaigns a step or lines are in."""
+    if isinstance(effect, BiasStep) and effect.campaign:
+        return f"The step found is in campaign {effect.campaign}."
+    if isinstance(effect, BiasPeriodic) and effect.campaigns:
+        return f"The lines found are in campaigns {', '.join(map(str, effect.campaigns))}, in this order."
+    return ""
 
 
 def _supersedes(name: str) -> tuple[str, ...]:
@@ -118,6 +130,7 @@ def judge(
             f"{len(step.rows)} samples next to gaps or the record's ends were left out beside {step.name}: what was "
             "not recorded still shows there."
         )
+    findings += [line for step in found if (line := _in_campaign(step.effect))]
     for i, step in enumerate(found):
         ranking, name = selection.left_out.get(i), step.name
         if ranking is None and len(found) > 1 and not uncontested(step):

@@ -45,7 +45,10 @@ class BiasDrift(Effect):
 
 
 class BiasStep(Effect):
-    """D += Δ·1(t ≥ t_k): the bias jumps once."""
+    """D += Δ·1(t ≥ t_k): the bias jumps once.
+
+    Of several campaigns it is `campaign` (counted from 1) in which it does; 0 stands for any.
+    """
 
     id = "bias_step"
     site = "rate"
@@ -57,10 +60,12 @@ class BiasStep(Effect):
     scan = "step"
     size: Float[Array, ""] = parameter("deg/h", 1.0, "bias after minus before")
     epoch: Float[Array, ""] = parameter("s", 1.0, "when it happens, from the start", linear=False, default=0.0)
+    campaign: int = eqx.field(static=True, default=0)
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """One from the epoch on."""
-        return stack((signals["time"] >= self.epoch).astype(float))
+        after = stack((signals["time"] >= self.epoch).astype(float))
+        return after * _within(signals, (self.campaign,)) if self.campaign else after
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
@@ -69,7 +74,11 @@ class BiasStep(Effect):
 
 
 class BiasPeriodic(Effect):
-    """D += Σ A_j cos 2πf_j t + B_j sin 2πf_j t: lines at unknown frequencies."""
+    """D += Σ A_j cos 2πf_j t + B_j sin 2πf_j t: lines at unknown frequencies.
+
+    Of several campaigns `campaigns` says which each line is in (counted from 1), as every start has a phase of its own;
+    empty, lines are in all.
+    """
 
     id = "bias_periodic"
     site = "rate"
@@ -82,26 +91,37 @@ class BiasPeriodic(Effect):
     cosine: Float[Array, " line"] = parameter("deg/h", 1.0, "in-phase amplitude of each line", default=(0.0,))
     sine: Float[Array, " line"] = parameter("deg/h", 1.0, "quadrature amplitude of each line", default=(0.0,))
     frequency: Float[Array, " line"] = parameter("Hz", 0.01, "their frequencies", linear=False, default=(0.01,))
+    campaigns: tuple[int, ...] = eqx.field(static=True, default=())
 
     def __check_init__(self) -> None:
         if not jnp.shape(self.cosine) == jnp.shape(self.sine) == jnp.shape(self.frequency):
             raise ValueError("every line needs a cosine, a sine and a frequency")
+        if self.campaigns and len(self.campaigns) != jnp.size(self.frequency):
+            raise ValueError("every line needs a campaign, or none")
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """The cosines, then the sines."""
         phase = 2.0 * jnp.pi * signals["time"][:, None] * self.frequency
-        return jnp.concatenate([jnp.cos(phase), jnp.sin(phase)], axis=1)
+        waves = jnp.concatenate([jnp.cos(phase), jnp.sin(phase)], axis=1)
+        return waves * _within(signals, self.campaigns * 2) if self.campaigns else waves
 
     def shape_derivatives(self, signals: Signals) -> Float[Array, "sample shape"]:
         """2πt (B cos 2πft − A sin 2πft), one a line: a jvp would compute every line for each."""
         turn = 2.0 * jnp.pi * signals["time"][:, None]
         phase = turn * self.frequency
-        return turn * (self.sine * jnp.cos(phase) - self.cosine * jnp.sin(phase))
+        moved = turn * (self.sine * jnp.cos(phase) - self.cosine * jnp.sin(phase))
+        return moved * _within(signals, self.campaigns) if self.campaigns else moved
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
         """Scanned at every frequency by the search."""
         return []
+
+
+def _within(signals: Signals, campaigns: tuple[int, ...]) -> Float[Array, "sample campaign"]:
+    """One where a sample is of a campaign, else zero; of one campaign alone, all are of the first."""
+    number = signals.get("campaign", jnp.ones_like(signals["time"]))
+    return (number[:, None] == jnp.array(campaigns)).astype(float)
 
 
 class BiasColumn(Effect):

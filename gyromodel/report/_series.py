@@ -227,6 +227,7 @@ def _derived(campaign: Campaign, found: dict[str, Abscissa]) -> dict[str, Abscis
 
 def _folded(diagnosis: Diagnosis) -> dict[str, Abscissa]:
     """The phase of a periodic bias that was found, over which it shows as one wave."""
+    from gyromodel.effects.drivers import BiasPeriodic
     from gyromodel.units import factor
 
     for cause in diagnosis.causes:
@@ -234,7 +235,14 @@ def _folded(diagnosis: Diagnosis) -> dict[str, Abscissa]:
             if cause.effect == "bias_periodic" and p.name in ("frequency", "frequency[0]") and p.value > 0.0:
                 seconds = np.asarray(diagnosis.campaign.in_unit("time", "s"), float)
                 phase = np.mod((seconds - seconds[0]) * p.value * factor(p.unit, "Hz"), 1.0)
-                return {"phase": Abscissa("phase", "phase of the period that was found", "1", phase, True)}
+                label = "phase of the period that was found"
+                if (number := diagnosis.campaign.columns.get("campaign")) is not None:
+                    first = next(e for e in diagnosis.extended.model.effects if isinstance(e, BiasPeriodic)).campaigns[
+                        :1
+                    ]
+                    phase[~np.isin(number, first or number)] = np.nan
+                    label += "".join(f", campaign {own}" for own in first)
+                return {"phase": Abscissa("phase", label, "1", phase, True)}
     return {}
 
 
