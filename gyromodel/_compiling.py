@@ -13,8 +13,11 @@ from gyromodel._cache import cache_folder
 
 # Bytes of compiled code that are kept; beyond, one begins anew.
 MOST_KEPT = 500_000_000
-# The newest jaxlib known to have the switch below: XLA ends the process over one that it does not know.
+# The newest jaxlib known to have these switches: XLA ends the process over one that it does not know.
 NEWEST_KNOWN = (0, 10, 2)
+FUSIONS = "xla_cpu_use_fusion_emitters"
+# Loops of up to so many bytes become one kernel: epochs of navigation cost what their arithmetic does.
+LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000000"
 
 
 def keep_compiled() -> None:
@@ -41,10 +44,11 @@ def former_fusions() -> dict[str, bool]:
 
     It compiles faster than the present one, and to faster code where arrays are joined.
     """
-    newest = tuple(int(part) for part in version("jaxlib").split(".")[:3] if part.isdigit())
-    return {"xla_cpu_use_fusion_emitters": False} if newest <= NEWEST_KNOWN else {}
+    jaxlib = tuple(int(part) for part in version("jaxlib").split(".")[:3] if part.isdigit())
+    return {FUSIONS: False} if jaxlib <= NEWEST_KNOWN else {}
 
 
-def take_former_fusions() -> None:
-    """Set them for everything that this process and those that it starts compile; call before JAX is imported."""
-    os.environ.setdefault("XLA_FLAGS", " ".join(f"--{k}={str(v).lower()}" for k, v in former_fusions().items()))
+def switch_compiler() -> None:
+    """Choose how XLA compiles for this process and those that it starts; call before JAX is imported."""
+    if former_fusions():
+        os.environ.setdefault("XLA_FLAGS", f"--{FUSIONS}=false {LOOPS}")

@@ -13,7 +13,7 @@ import typer
 
 import gyromodel
 from gyromodel._atomic import write_text
-from gyromodel._compiling import keep_compiled, take_former_fusions
+from gyromodel._compiling import keep_compiled, switch_compiler
 from gyromodel._console import (
     json_text,
     prepare_folder,
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             stream.reconfigure(errors="replace")  # an equation's ε must not stop a terminal that lacks it
     if not {"--help", "--version"} & {*(sys.argv[1:] if arguments is None else arguments)}:
         keep_compiled()
-        take_former_fusions()
+        switch_compiler()
     try:
         typer.main.get_command(app)(args=arguments, prog_name="gyromodel")
     except Exception as error:

@@ -26,7 +26,11 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("MPLBACKEND", "agg")
 if version("jaxlib") == "0.10.2":  # as commands have it: gyromodel/_compiling.py; workers compile side by side anyway
-    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1")
+    os.environ.setdefault(
+        "XLA_FLAGS",
+        "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 "
+        "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000000",
+    )
 os.environ.setdefault("GYROMODEL_TEST_SEED", str(secrets.randbelow(2**32)))
 
 settings.register_profile(
