@@ -22,6 +22,7 @@ from gyromodel.platform import (
     FREQUENCIES,
     BaseMotion,
     Explanation,
+    Points,
     VibrationTest,
     explain,
     fit_sines,
@@ -32,6 +33,7 @@ from gyromodel.platform import (
     responses,
     vibration_test,
 )
+from gyromodel.platform._assessment import _explained
 from gyromodel.report import vibration_words, with_uncertainty
 
 LOG = Path(gyromodel.__file__).parent / "data" / "platform_vibration.csv.gz"
@@ -159,6 +161,23 @@ def test_the_readme_prints_what_the_command_does(demo: VibrationTest, capsys: py
     series = {row.name: row for row in parameters(demo.series)} if demo.series else {}
     for name in ("time offset", "friction over inertia X", "friction over inertia Z"):
         assert with_uncertainty(series[name].value, series[name].std, series[name].unit) in readme
+
+
+def test_a_delay_is_no_friction_that_no_loop_would_hold(rng: np.random.Generator):
+    """With a corner far above all frequencies friction delays by c/(J ω_c ω_i) and does nothing else."""
+    draws = []
+    for w in (1.0, 10.0, 30.0):
+        angle = w * np.arange(SAMPLES) * STEP
+        table, base = np.sin(angle), np.sin(angle - 2e-3 * w)
+        draws.append([AMPLITUDE * x + SECOND * rng.standard_normal(SAMPLES) for x in (base, table)])
+    found, _ = responses(motion(*(np.stack(x) for x in zip(*draws, strict=True))))
+    at = Points(np.zeros(3, int), np.array([r.frequency for r in found]), np.ones(3), np.zeros(3), np.full(3, AMPLITUDE))
+    explanations = _explained(at, found, known=True)
+    assert explanations["time offset"].probability > 1e-6
+    rates = {name: {row.name: row.value for row in parameters(e)} for name, e in explanations.items()}
+    # The default loop's damping over its inertia: 210 1/s.
+    assert all(row.get("friction over inertia X", 0.0) < 210.0 for row in rates.values())
+    assert "friction" in rates
 
 
 @pytest.mark.long
