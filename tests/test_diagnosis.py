@@ -20,13 +20,13 @@ from scipy.special import gammaln
 
 import gyromodel as gm
 from gyromodel.averages import average
+from gyromodel.diagnosis import Cause
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores
 from gyromodel.diagnosis._evidence import SIZES, explained_for, log_evidence_ratio
 from gyromodel.diagnosis._pairs import best_pair
 from gyromodel.diagnosis._ranking import rank
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis import Cause
 from gyromodel.diagnosis._verdict import _as_set, _places
 from gyromodel.effects.thermal import BiasWarmup
 from gyromodel.estimate import EstimateError, fit_record

@@ -146,7 +146,7 @@ def test_one_frequency_about_one_axis_cannot_tell():
 
 @pytest.mark.parametrize("axis", ["Y", "Z"])
 def test_readings_of_gimbals_that_hardly_move_hold_no_error(axis: str):
-    """One axis alone: the other gimbals follow the Earth, and the noise of their readings is in the base's angle too."""
+    """One axis alone: the other gimbals follow the Earth, and their readings' noise is in the base's angle too."""
     log = vibration(seed=1)
     diagnosis = found(log.select(np.isin(log.columns["segment"], "XYZ".index(axis) + np.array([1, 4, 7, 10]))))
     assert (diagnosis.verdict, diagnosis.causes) == ("adequate", ())
