@@ -20,13 +20,14 @@ from scipy.special import gammaln
 
 import gyromodel as gm
 from gyromodel.averages import average
+from gyromodel.diagnosis import Cause
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores
 from gyromodel.diagnosis._evidence import SIZES, explained_for, log_evidence_ratio
 from gyromodel.diagnosis._pairs import best_pair
 from gyromodel.diagnosis._ranking import rank
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._verdict import _places
+from gyromodel.diagnosis._verdict import _as_set, _places
 from gyromodel.effects.thermal import BiasWarmup
 from gyromodel.estimate import EstimateError, fit_record
 from gyromodel.model import record_span
@@ -451,3 +452,12 @@ def test_a_compensated_output_is_no_driver(rng: np.random.Generator) -> None:
     for name in ("rate_estimated", "rate_estimated_std"):
         log = log.with_column(name, rng.uniform(1.0, 2.0, len(log)), "deg/s")
     assert not any("rate_estimated" in name for name in build_bank(read_signals(log)).names())
+
+
+def test_a_rival_ahead_of_all_numbers_has_a_finite_evidence():
+    """Of a share that underflows only a bound is known."""
+    cause = Cause("bias", (), 10.0, 0.0, 0.0, 0.0)
+    both = _as_set(cause, {"bias": 0.0, "bias_drift": 1.0})
+    assert [c.effect for c in both] == ["bias", "bias_drift"]
+    assert 700 < both[1].statistic - cause.statistic < 800
+    assert _as_set(cause, {"bias": 0.25, "bias_drift": 0.75})[1].statistic == pytest.approx(10.0 + np.log(3.0))

@@ -27,7 +27,14 @@ from gyromodel.model import GyroModel, ModelError, make_effect, model_from_effec
 from gyromodel.model_files import read_model, write_model
 from gyromodel.platform import fit_vibration, vibration_record
 from gyromodel.units import from_internal
-from tests.truth.platform_designs import in_steps, late_and_tilted, simulation_with_friction, sticking, vibration
+from tests.truth.platform_designs import (
+    in_steps,
+    late_and_rubbing,
+    late_and_tilted,
+    simulation_with_friction,
+    sticking,
+    vibration,
+)
 
 NOTHING = model_from_effects([])
 PLATFORM = sorted(name for name, kind in CATALOGUE.items() if kind.domain == "platform")
@@ -135,6 +142,24 @@ def test_one_frequency_about_one_axis_cannot_tell():
     assert set(diagnosis.credible_set) == {"sync_delay", "shaft_friction"}
     assert "several frequencies" in str(diagnosis.next_test)
     assert "shaft_friction" in alone("shaft_friction").credible_set
+
+
+@pytest.mark.parametrize("axis", ["Y", "Z"])
+def test_readings_of_gimbals_that_hardly_move_hold_no_error(axis: str):
+    """One axis alone: the other gimbals follow the Earth, and their readings' noise is in the base's angle too."""
+    log = vibration(seed=1)
+    diagnosis = found(log.select(np.isin(log.columns["segment"], "XYZ".index(axis) + np.array([1, 4, 7, 10]))))
+    assert (diagnosis.verdict, diagnosis.causes) == ("adequate", ())
+
+
+@pytest.mark.parametrize("axis", ["X", "Z"])
+def test_a_delay_and_friction_about_one_axis(axis: str, seed: int):
+    """A corner far above all frequencies made a delay of friction, of more than a loop holds."""
+    log = late_and_rubbing(2 * MS, 0.5, seed)
+    diagnosis = found(log.select(np.isin(log.columns["segment"], "XYZ".index(axis) + np.array([1, 4, 7, 10]))))
+    # One draw in ten has a resonance beside them, in doubt.
+    assert {cause.effect for cause in diagnosis.causes} >= {"sync_delay", "shaft_friction"}
+    assert values(diagnosis)["sync_delay.delay"][0] == pytest.approx(2.0, abs=0.3)
 
 
 def test_units_do_not_matter(seed: int):
@@ -273,6 +298,8 @@ def test_what_is_written_wrong_is_refused():
         ShaftFriction([0.1], shafts=("gimbal_w",))
     with pytest.raises(ValueError, match="one number for each"):
         ShaftFriction([0.1], shafts=("gimbal_x", "gimbal_z"))
+    with pytest.raises(ValueError, match="viscous is below one"):
+        ShaftFriction([1.5], shafts=("gimbal_x",))
     with pytest.raises(ValueError, match="is no term"):
         EncoderHarmonic([0.0], [0.0], ("gimbal_x/9",))
 

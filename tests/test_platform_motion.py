@@ -86,9 +86,10 @@ def test_angles_may_wrap(log: Campaign):
         lambda c: c.with_metadata({"table_axes": "-roll, azimuth, pitch"}),
         lambda c: c.with_metadata({"table_axes": "azimuth, roll, pitch"}),
         lambda c: c.with_column("table_x", c.columns["table_x"], "arcsec"),
+        lambda c: c.with_column("gimbal_z", c.columns["gimbal_z"], "mrad"),
         lambda c: c.with_column("gimbal_z", 0.0 * c.columns["gimbal_z"], "deg"),
     ],
-    ids=["sign", "axes", "unit", "dead encoder"],
+    ids=["sign", "axes", "unit", "mrad", "dead encoder"],
 )
 def test_axes_that_do_not_move_alike_are_refused(log: Campaign, change):
     """They would pass for a delay of half a period, or for a mode."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import gzip
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -22,6 +23,7 @@ from gyromodel.platform import (
     FREQUENCIES,
     BaseMotion,
     Explanation,
+    Points,
     VibrationTest,
     explain,
     fit_sines,
@@ -32,6 +34,7 @@ from gyromodel.platform import (
     responses,
     vibration_test,
 )
+from gyromodel.platform._assessment import _explained
 from gyromodel.report import vibration_words, with_uncertainty
 
 LOG = Path(gyromodel.__file__).parent / "data" / "platform_vibration.csv.gz"
@@ -159,6 +162,49 @@ def test_the_readme_prints_what_the_command_does(demo: VibrationTest, capsys: py
     series = {row.name: row for row in parameters(demo.series)} if demo.series else {}
     for name in ("time offset", "friction over inertia X", "friction over inertia Z"):
         assert with_uncertainty(series[name].value, series[name].std, series[name].unit) in readme
+
+
+def explained(rng: np.random.Generator, passed: Callable[[float], complex]) -> dict[str, Explanation]:
+    """Explanations of three runs of X whose base moves by what a transfer function of jω makes of the table."""
+    frequencies, draws = (1.0, 10.0, 30.0), []
+    for w in frequencies:
+        wave = np.exp(1j * w * np.arange(SAMPLES) * STEP)
+        draws.append([AMPLITUDE * x.imag + SECOND * rng.standard_normal(SAMPLES) for x in (passed(w) * wave, wave)])
+    found, _ = responses(motion(*(np.stack(x) for x in zip(*draws, strict=True))))
+    at = Points(np.zeros(3, int), np.array(frequencies), np.ones(3), np.zeros(3), np.full(3, AMPLITUDE))
+    return _explained(at, found, known=True)
+
+
+def test_an_isolator_is_no_time_offset(rng: np.random.Generator):
+    """60 rad/s, damped against the table by 0.1 of critical."""
+    natural, damping = 60.0, 0.1
+
+    def isolator(w: float) -> complex:
+        s = 1j * w / natural
+        return (1 + 2 * damping * s) / (1 + 2 * damping * s + s**2)
+
+    explanations = explained(rng, isolator)
+    assert min(explanations, key=lambda name: explanations[name].criterion).startswith(
+        ("resonance, d", "time offset, r")
+    )
+    right = explanations["resonance, damped"]
+    assert right.probability > 1e-6
+    assert explanations["time offset, resonance"].probability < 1e-6
+    rows = {row.name: row for row in parameters(right)}
+    assert rows["lag"].value == pytest.approx(1e3 * 2 * damping / natural, abs=5 * rows["lag"].std)
+    assert rows["compliance X"].value == pytest.approx(1e6 / natural**2, abs=5 * rows["compliance X"].std)
+    late = parameters(explanations["time offset, resonance, damped"])[0]
+    assert abs(late.value) < 5 * late.std
+
+
+def test_a_delay_is_no_friction_that_no_loop_would_hold(rng: np.random.Generator):
+    """With a corner far above all frequencies friction delays by c/(J ω_c ω_i) and does nothing else."""
+    explanations = explained(rng, lambda w: np.exp(-2e-3j * w))
+    assert explanations["time offset"].probability > 1e-6
+    rates = {name: {row.name: row.value for row in parameters(e)} for name, e in explanations.items()}
+    # The default loop's damping over its inertia: 210 1/s.
+    assert all(row.get("friction over inertia X", 0.0) < 210.0 for row in rates.values())
+    assert "friction" in rates
 
 
 @pytest.mark.long

@@ -266,11 +266,13 @@ def _close_rival(step: Found, members: dict[str, float]) -> str | None:
 
 
 def _as_set(cause: Cause, members: dict[str, float]) -> tuple[Cause, ...]:
+    # A share may be too small for a number.
+    share = {k: max(v, np.finfo(float).tiny) for k, v in members.items()}
     others = [
         Cause(
             k,
             (),
-            cause.statistic + np.log(v / members[cause.effect]) if cause.effect in members else cause.statistic,
+            cause.statistic + float(np.log(share[k]) - np.log(share.get(cause.effect, share[k]))),
             cause.p_value,
             cause.p_adjusted,
             v,

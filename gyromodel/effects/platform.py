@@ -181,6 +181,9 @@ class _ThroughLoop(_OfPlatform):
             raise ValueError(f"{min(unknown)} is no shaft that turns the platform: these are {', '.join(SHAFTS)}")
         if {np.shape(v)[0] for v in (self.viscous, self.coulomb)} - {0, len(self.shafts)}:
             raise ValueError("viscous and coulomb take one number for each of the shafts, or none")
+        # Far above all frequencies a corner makes a delay of friction, of more than holds any body.
+        if np.any(np.asarray(self.viscous) >= 1.0):
+            raise ValueError("viscous is below one: friction drags the platform less than its loop holds it")
 
     def turned(self, signals: Signals, gain: Float[Array, ""] | float = 1.0) -> Float[Array, "sample coefficient"]:
         """−Re[R ∂θ/∂β z] of each shaft's viscous friction, then its Coulomb friction; the loop's gain times `gain`."""

@@ -15,12 +15,23 @@ from gyromodel._checks import CampaignError, listed
 from gyromodel.campaign import Campaign
 from gyromodel.estimate import EstimateError
 from gyromodel.platform._acceptance import AXES
-from gyromodel.platform._explanations import ALTERNATIVES, ENTRIES, Explanation, Points, explain, points, separation
+from gyromodel.platform._explanations import (
+    ALTERNATIVES,
+    ENTRIES,
+    Explanation,
+    Points,
+    assumed_loop,
+    explain,
+    points,
+    separation,
+)
 from gyromodel.platform._loop import Loop
 from gyromodel.platform._motion import BaseMotion, base_motion
 from gyromodel.platform._responses import LEVEL, Response, responses
 from gyromodel.platform._series import fit_series
 
+# Entries that are viscous friction.
+FRICTION = [ENTRIES.index(f"friction {axis}") for axis in AXES]
 # Below this probability of its sum of squares an explanation is excluded.
 EXCLUDED = 0.01
 # Akaike's criterion above the best up to which an explanation is supported: one twentieth as likely.
@@ -209,7 +220,13 @@ def _explained(at: Points, found: list[Response], known: bool) -> dict[str, Expl
             explanations[name] = explain(alternative, at, gain, phase, phase_std=phase_std, gain_std=gain_std)
         except EstimateError:
             continue  # too few points for it
-    return {name: e for name, e in explanations.items() if e.degrees_of_freedom > 0}
+    return {name: e for name, e in explanations.items() if e.degrees_of_freedom > 0 and _held(e)}
+
+
+def _held(found: Explanation) -> bool:
+    """Whether the loop holds the body more than friction drags it: else the two make a delay, and no platform."""
+    loop = assumed_loop(found)
+    return float(found.value[FRICTION].max()) < float(loop.amplifier * loop.correction * loop.motor)
 
 
 def _further(rivals: dict[str, Explanation], at: Points, integrated: float) -> dict[str, float]:

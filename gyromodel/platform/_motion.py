@@ -25,8 +25,8 @@ from gyromodel.platform._navigation import attitudes
 GIMBALS = ("gimbal_y_outer", "gimbal_x", "gimbal_y", "gimbal_z")
 TABLE = tuple(f"table_{axis}" for axis in AXES)
 TURNS = ("roll", "azimuth", "pitch")
-# Ratio of two motions, and the angle (rad) between them, that are not of one axis.
-UNLIKE, AGAINST = 20.0, np.deg2rad(150.0)
+# Ratio of two motions, and the angle (rad) between them, that are not of one axis: degrees taken for mrad are 17.
+UNLIKE, AGAINST = 15.0, np.deg2rad(150.0)
 
 
 class BaseMotion(NamedTuple):

@@ -36,6 +36,8 @@ UNKNOWN = 1e6
 SEEN, UNLIKE = 50.0, 0.05
 # What whole turns taken off leave of an angle (rad).
 ROUNDED = 1e-13
+# Sines that a gimbal's motion is made of, the fundamental included.
+OVERTONES = 4
 # Steps of its encoder by which a gimbal turns if its friction is to be told.
 RESOLVED = 10
 # Times that a reading returns where the steps of an encoder show.
@@ -86,12 +88,15 @@ def vibration_record(campaigns: Campaign | Sequence[Campaign]) -> VibrationRecor
     runs, findings, count = [], [], 0
     for campaign in campaigns:
         motion = base_motion(campaign)
-        changes, step = _sensitivities(motion), _step(campaign)
+        step = _step(campaign)
+        # What an error may follow must not hold the noise of the readings that it is the error of.
+        smooth = motion._replace(gimbals=_smooth(motion))
+        changes = _sensitivities(smooth)
         for k in range(motion.segment[-1] + 1):
             count += 1
             rows = np.flatnonzero(motion.segment == k)
             name = f"Run {count}" if motion.segment[-1] or len(campaigns) > 1 else "The run"
-            run = _run(motion, rows, changes, step)
+            run = _run(motion, smooth.gimbals[rows], rows, changes, step)
             if isinstance(run, str):
                 findings.append(f"{name} was left out: {run}.")
             else:
@@ -145,8 +150,8 @@ class _Run(NamedTuple):
     turns: list[tuple[np.ndarray, float]]
 
 
-def _run(motion: BaseMotion, rows: np.ndarray, changes: np.ndarray, step: float) -> _Run | str:
-    """A run, read by encoders of some step, or why it cannot be used."""
+def _run(motion: BaseMotion, smooth: np.ndarray, rows: np.ndarray, changes: np.ndarray, step: float) -> _Run | str:
+    """A run, read by encoders of some step, its gimbals' angles without noise, or why it cannot be used."""
     time = motion.time[rows] - motion.time[rows[0]]
     if len(rows) < FEWEST:
         return f"it has {len(rows)} rows, and {FEWEST} are needed"
@@ -165,7 +170,28 @@ def _run(motion: BaseMotion, rows: np.ndarray, changes: np.ndarray, step: float)
     turn = _aligning(changes, output[..., None])
     output = output - (changes[..., :3] @ turn)[..., 0]
     changes = np.concatenate([changes, _drifting(changes, time)], axis=2)
-    return _Run(time, table, output, gimbals, changes, waves, turns)
+    return _Run(time, table, output, smooth, changes, waves, turns)
+
+
+def _smooth(motion: BaseMotion) -> np.ndarray:
+    """Angles of the gimbals without the noise of their readings: in each run a line, an oscillation and its overtones.
+
+    A reading that hardly moves is noise, and so is what a tilt or an encoder's error would make of it.
+    """
+    smooth = motion.gimbals.copy()
+    for k in range(motion.segment[-1] + 1):
+        rows = np.flatnonzero(motion.segment == k)
+        if len(rows) < FEWEST:
+            continue
+        time = motion.time[rows] - motion.time[rows].mean()
+        for gimbal in range(len(GIMBALS)):
+            angle = motion.gimbals[rows, gimbal]
+            w = _sine(time - time[0], angle, drifts=True)[1]
+            # At two samples a period an overtone is one of any frequency.
+            phases = [n * w * time for n in range(1, OVERTONES + 1) if 0 < n * w * np.diff(time).mean() < 0.9 * np.pi]
+            columns = np.column_stack([np.ones_like(time), time, *(f(p) for p in phases for f in (np.sin, np.cos))])
+            smooth[rows, gimbal] = columns @ np.linalg.lstsq(columns, angle, rcond=None)[0]
+    return smooth
 
 
 def _aligning(changes: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -208,7 +234,6 @@ def _stretches(run: _Run, phase: float) -> list[dict[str, np.ndarray]]:
     linear = linear - run.changes[..., :3] @ _aligning(run.changes, linear)
     # Every encoder is taken to be as good as the others: the noise of an angle is that of the table and the gimbals.
     noise = 0.5 * (1.0 + np.mean(run.changes[..., 6:10] ** 2, axis=0).sum(-1))
-    # What an error may follow must not hold the noise of the readings that it is the error of.
     driver = {
         name: mean(np.real(wave)) + run.gimbals[:, i].mean()
         for i, (name, (wave, _)) in enumerate(zip(GIMBALS, run.turns, strict=True))

@@ -105,6 +105,11 @@ def late_and_tilted(delay: float, tilt: float, seed: int = 0) -> Campaign:
     return logged(_simulated("gimbal_nonorthogonality", tilt), hidden("sync_delay", delay), seed)
 
 
+def late_and_rubbing(delay: float, viscous: float, seed: int = 0) -> Campaign:
+    """Records that are late, and friction."""
+    return logged(_simulated("shaft_friction", viscous), hidden("sync_delay", delay), seed)
+
+
 @cache
 def _sticking() -> Run:
     return platform.simulate(FREE._replace(viscous=np.full(4, 0.1), coulomb=np.full(4, 0.05)), *common(), LENGTH)
