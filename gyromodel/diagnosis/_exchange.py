@@ -13,7 +13,7 @@ LINE_LEAD = 20.0
 # Functions of time that one run cannot tell from a random walk, and the lead (nats) over it at which they are put
 # beside it.
 SLOW_IN_TIME = ("bias_drift", "bias_warmup", "bias_step")
-SLOW_LEAD = 2.5
+SLOW_LEAD = 3.5
 
 
 def exchanged(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[list[Found], Estimate, dict[int, Ranking]]:

@@ -24,6 +24,8 @@ MAXIMUM_ROUNDS = 12
 MAXIMUM_STEPS = 3
 # A function of time alone must beat a random walk by this much in one run: no real slow noise is exactly a random walk.
 TIME_MARGIN = 15.0
+# Nats by which a cause that no catalogue lists must do better: it is rarer than one that does.
+UNLISTED = 1.0
 
 
 @dataclass(frozen=True)
@@ -164,7 +166,7 @@ def _significant_driver(ranking: Ranking, threshold: float, runs: int) -> str | 
     """The leading smooth driver, if it is significant; for one of time beside slow noise, over what a walk makes."""
     driver, score = ranking.best(drivers=True)
     like_a_walk = driver == "smooth(time)" and runs < 2 and ranking.slow_noise
-    return driver if score >= (max(threshold, TIME_MARGIN) if like_a_walk else threshold) else None
+    return driver if score >= (max(threshold, TIME_MARGIN) if like_a_walk else threshold + UNLISTED) else None
 
 
 def _before(i: int, path: list[Found], estimates: list[Estimate]) -> Selection:
