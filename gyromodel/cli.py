@@ -15,6 +15,8 @@ import gyromodel
 from gyromodel._atomic import write_text
 from gyromodel._compiling import keep_compiled, take_former_fusions
 from gyromodel._console import (
+    INTERRUPTED,
+    interrupts_kept,
     json_text,
     prepare_folder,
     print_paths,
@@ -51,7 +53,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         keep_compiled()
         take_former_fusions()
     try:
-        typer.main.get_command(app)(args=arguments, prog_name="gyromodel")
+        with interrupts_kept():
+            typer.main.get_command(app)(args=arguments, prog_name="gyromodel")
+    except SystemExit as end:
+        if end.code == INTERRUPTED:
+            print("gyromodel: interrupted; no file is half written, and batch goes on where it was", file=sys.stderr)
+        raise
     except Exception as error:
         if os.environ.get("GYROMODEL_DEBUG") == "1":
             raise

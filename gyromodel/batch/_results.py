@@ -15,6 +15,7 @@ from typing import Any, Self
 import pyarrow as pa
 from pyarrow import parquet
 
+from gyromodel._atomic import sibling
 from gyromodel._checks import CampaignError
 from gyromodel.batch._archive import Entry
 
@@ -168,12 +169,9 @@ def read_results(path: Path) -> pa.Table:
 
 def write_table(table: pa.Table, path: Path) -> None:
     """Whole or not at all, and on disk."""
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
+    with sibling(path) as temporary:
         with open(temporary, "wb") as file:
             parquet.write_table(table, file, compression="zstd")
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

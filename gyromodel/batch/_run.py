@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+import signal
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from itertools import zip_longest
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -131,10 +133,13 @@ def _on_cluster(lots: Sequence[Lot], workers: int, scheduler: str | None) -> Ite
     from dask.config import set as configured
     from distributed import Client, LocalCluster, as_completed
 
+    # Its warnings, and its tracebacks while it ends, are of no use to who waits for a table.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
     with configured({"distributed.scheduler.allowed-failures": LOST}), ExitStack() as open_ones:
         if scheduler is None:
             quiet = {"dashboard_address": "", "silence_logs": logging.CRITICAL}
-            cluster = open_ones.enter_context(LocalCluster(n_workers=workers, threads_per_worker=1, **quiet))
+            with _deaf_to_interrupts():
+                cluster = open_ones.enter_context(LocalCluster(n_workers=workers, threads_per_worker=1, **quiet))
         try:
             client = open_ones.enter_context(Client(scheduler or cluster, timeout=PATIENCE))
         except OSError:
@@ -160,6 +165,17 @@ def _on_cluster(lots: Sequence[Lot], workers: int, scheduler: str | None) -> Ite
             else:
                 yield lot, [failed(lot.heads()[0], future.exception())]
             running.update(submitted(1))
+
+
+@contextmanager
+def _deaf_to_interrupts() -> Iterator[None]:
+    """Threads and processes that begin here, and those that these begin, leave Ctrl-C to the main thread."""
+    resource_tracker.ensure_running()  # what starts it lets the signal through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 class _Pace:
