@@ -342,6 +342,9 @@ def batch(
         print(json_text(result), end="")
     else:
         print(f"{done.campaigns} campaigns, {done.examined} examined in this run; {len(done.table)} rows in {output}")
+    if done.references:
+        named = ", ".join(f"{effect} to {text}" for effect, (_, text) in done.references.items())
+        print(f"gyromodel: all campaigns refer {named} (reference: in the model sets another)", file=sys.stderr)
     if done.failed:
         print(f"gyromodel: {done.failed} of {done.campaigns} campaigns failed: see column reason", file=sys.stderr)
         sys.exit(1)

@@ -438,3 +438,27 @@ def test_a_scheduler_that_is_not_there_is_said(tmp_path: Path):
     assert status == 1
     assert "no Dask scheduler answers" in str(result["said"])
     assert os.listdir(tmp_path / ".results.parquet.parts") == ["lock"]
+
+
+def test_biases_of_an_archive_are_of_one_temperature(tmp_path: Path):
+    """Of like gyros measured at other temperatures, and whatever is measured later."""
+    place = tmp_path / "archive"
+    place.mkdir()
+    (tmp_path / "model.yaml").write_text(STATED)
+
+    def measured(k: int, name: str):
+        warmer = np.array(campaign(k).columns["temperature"]) + 10 * k
+        output = campaign(k).columns["output"] + 0.2 * 10 * k
+        changed = campaign(k).with_column("temperature", warmer, "degC").with_column("output", output, "deg/h")
+        write_campaign(changed, place / name)
+
+    for k in range(4):
+        measured(k, f"c{k}.csv")
+    first = here(tmp_path)
+    assert set(first.references) == {"bias_temperature"}
+    measured(5, "a5.csv")
+    done = here(tmp_path)
+    assert (done.examined, done.references) == (1, first.references)
+    found = [row for row in done.table.to_pylist() if row["parameter"] == "bias.value"]
+    expected = 3 + 0.2 * (first.references["bias_temperature"][0] - 20)
+    assert max(abs(row["value"] - expected) / row["std"] for row in found) < 5

@@ -8,6 +8,7 @@ import os
 import shutil
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -47,7 +48,7 @@ class Results:
 
     def __init__(self, path: Path, made_by: Mapping[str, str]) -> None:
         self.path, self.made_by = path, dict(made_by)
-        self._folder = path.with_name(f".{path.name}.parts")
+        self._folder = _parts_of(path)
         self._tables: list[pa.Table] = []
         self._waiting: list[dict[str, Any]] = []
         self._written = 0.0
@@ -149,6 +150,18 @@ class Results:
             return MADE_BY in (parquet.read_schema(part).metadata or {})
         except (pa.ArrowException, OSError):
             return False
+
+
+def _parts_of(path: Path) -> Path:
+    return path.with_name(f".{path.name}.parts")
+
+
+def made_by_of(path: Path) -> dict[str, str]:
+    """What made a table, or the parts of one that is not finished; empty where there is none."""
+    for file in (path, *sorted(_parts_of(path).glob("*.parquet"))):
+        with suppress(pa.ArrowException, OSError):
+            return json.loads((parquet.read_schema(file).metadata or {}).get(MADE_BY, b"{}"))
+    return {}
 
 
 def read_results(path: Path) -> pa.Table:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import signal
 import time
@@ -19,8 +20,8 @@ import pyarrow as pa
 import gyromodel
 from gyromodel._checks import CampaignError
 from gyromodel.batch._archive import Entry, entries
-from gyromodel.batch._results import Results
-from gyromodel.batch._work import Lot, Row, examine, failed, read
+from gyromodel.batch._results import Results, made_by_of
+from gyromodel.batch._work import Lot, Row, examine, failed, open_references, read, with_references
 from gyromodel.model import GyroModel
 
 # Lots that wait at each worker, so that none is idle, and times that one may lose its worker.
@@ -34,12 +35,17 @@ RECENT = 60.0
 
 
 class Batch(NamedTuple):
-    """Results of an archive: the table, and how many campaigns there were, were examined in this run, and failed."""
+    """Results of an archive: the table, and how many campaigns there were, were examined in this run, and failed.
+
+    `references` holds the reference points that the model left open and all campaigns share, by effect: in internal
+    units, and as a text.
+    """
 
     table: pa.Table
     campaigns: int
     examined: int
     failed: int
+    references: dict[str, tuple[float, str]]
 
 
 def run_batch(
@@ -57,7 +63,8 @@ def run_batch(
 
     A campaign that cannot be read or fitted is a row with the reason. Campaigns that an earlier run has finished, and
     that have not changed since, are not examined again, unless the machine was at fault and not the data; those that
-    are gone from the archive leave the table.
+    are gone from the archive leave the table. Reference points that the model leaves open are those of the first
+    campaign in all, so that their parameters compare.
 
     Args:
         archive: see `entries`.
@@ -80,6 +87,12 @@ def run_batch(
         "version": gyromodel.__version__,
         "task": task,
     }
+    # As before: the first campaign may be another one now.
+    before = json.loads(made_by_of(results).get("references", "{}"))
+    references = {name: (value, text) for name, (value, text) in before.items()} or open_references(every, model)
+    if references:
+        made_by["references"] = json.dumps(references)
+        model = with_references(model, references)
     with Results(results, made_by) as kept:
         finished = kept.finished()
         states = {entry: entry.state for entry in every}
@@ -101,7 +114,7 @@ def run_batch(
         for name, status in zip(table["campaign"].to_pylist(), table["status"].to_pylist(), strict=True)
         if status == "failed"
     }
-    return Batch(table, len(every), len(todo), len(lost))
+    return Batch(table, len(every), len(todo), len(lost), references)
 
 
 def _parted(todo: Sequence[Entry], states: Mapping[Entry, str], most: int) -> Iterator[list[Entry]]:
