@@ -3,9 +3,43 @@
 from __future__ import annotations
 
 import errno
+import glob
 import os
-import tempfile
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+
+
+@contextmanager
+def sibling(target: Path) -> Iterator[Path]:
+    """A hidden name beside a target, for what is to take its place; what still has it at the end is removed.
+
+    What killed runs have left there is removed first: a run that writes holds a lock on the folder, which the system
+    takes back however the run ends.
+    """
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
+    with ExitStack() as held:
+        with suppress(ImportError, OSError):  # where locks are unknown, nothing is removed
+            import fcntl
+
+            folder = os.open(target.parent, os.O_RDONLY)
+            held.callback(os.close, folder)
+            with suppress(BlockingIOError):
+                fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                for left in target.parent.glob(f".{glob.escape(target.name)}.{'?' * 8}.tmp"):
+                    _remove(left)
+            fcntl.flock(folder, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        held.callback(_remove, temporary)
+        yield temporary
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -13,12 +47,6 @@ def write_text(path: Path, text: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        os.unlink(name)
-        raise
+    with sibling(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+        os.replace(temporary, path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -15,6 +16,8 @@ import typer
 if TYPE_CHECKING:
     from gyromodel.campaign import Campaign
 
+# Exit status after Ctrl-C, as of typer and shells.
+INTERRUPTED = 130
 # Errors that mean "the data or the model cannot answer", by the module that defines them.
 _REFUSALS = {
     "gyromodel._checks": "CampaignError",
@@ -33,6 +36,25 @@ def refusal(error: Exception) -> str:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     found = " ".join(f"{type(error).__name__}: {error}".split())[:200]
     return f"internal error ({found}); please report it with the output under GYROMODEL_DEBUG=1"
+
+
+@contextmanager
+def interrupts_kept() -> Iterator[None]:
+    """Repeat a Ctrl-C that is lost since it comes within a callback of the garbage collector, as JAX has."""
+    before = sys.unraisablehook
+
+    def again(lost: Any) -> None:
+        if not issubclass(lost.exc_type, KeyboardInterrupt):
+            before(lost)
+            return
+        signal.signal(signal.SIGALRM, signal.default_int_handler)
+        signal.setitimer(signal.ITIMER_REAL, 0.01)
+
+    sys.unraisablehook = again
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
 
 
 def read_campaigns(paths: Sequence[Path], axis: str | None) -> list[Campaign]:

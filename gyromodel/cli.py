@@ -15,6 +15,8 @@ import gyromodel
 from gyromodel._atomic import write_text
 from gyromodel._compiling import keep_compiled, switch_compiler
 from gyromodel._console import (
+    INTERRUPTED,
+    interrupts_kept,
     json_text,
     prepare_folder,
     print_paths,
@@ -51,7 +53,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         keep_compiled()
         switch_compiler()
     try:
-        typer.main.get_command(app)(args=arguments, prog_name="gyromodel")
+        with interrupts_kept():
+            typer.main.get_command(app)(args=arguments, prog_name="gyromodel")
+    except SystemExit as end:
+        if end.code == INTERRUPTED:
+            print("gyromodel: interrupted; no file is half written, and batch goes on where it was", file=sys.stderr)
+        raise
     except Exception as error:
         if os.environ.get("GYROMODEL_DEBUG") == "1":
             raise
@@ -335,6 +342,9 @@ def batch(
         print(json_text(result), end="")
     else:
         print(f"{done.campaigns} campaigns, {done.examined} examined in this run; {len(done.table)} rows in {output}")
+    if done.references:
+        named = ", ".join(f"{effect} to {text}" for effect, (_, text) in done.references.items())
+        print(f"gyromodel: all campaigns refer {named} (reference: in the model sets another)", file=sys.stderr)
     if done.failed:
         print(f"gyromodel: {done.failed} of {done.campaigns} campaigns failed: see column reason", file=sys.stderr)
         sys.exit(1)

@@ -10,7 +10,6 @@ import gzip
 import math
 import mmap
 import os
-import secrets
 import shutil
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -20,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from gyromodel._atomic import sibling
 from gyromodel._checks import CampaignError, check_unit, shown
 from gyromodel._csv import (
     Contents,
@@ -107,30 +107,25 @@ def replacing(target: Path) -> Iterator[Path]:
         CampaignError: a folder of something else is there, or it cannot be written.
     """
     path = Path(os.path.realpath(target))
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
         if path.is_dir() and not (_suffix(path) == ".zarr" and any((path / name).exists() for name in _ZARR_FILES)):
             raise CampaignError(f"{target}: is a folder that holds something else than a campaign")
-        yield temporary
-        if path.is_dir():
-            # A folder cannot be replaced in one step: the old one steps aside first.
-            aside = temporary.with_suffix(".old")
-            os.replace(path, aside)
-            try:
+        with sibling(path) as temporary:
+            yield temporary
+            if path.is_dir():
+                # A folder cannot be replaced in one step: the old one steps aside first.
+                aside = temporary.with_suffix(".old")
+                os.replace(path, aside)
+                try:
+                    os.replace(temporary, path)
+                except OSError:
+                    os.replace(aside, path)
+                    raise
+                shutil.rmtree(aside)
+            else:
                 os.replace(temporary, path)
-            except OSError:
-                os.replace(aside, path)
-                raise
-            shutil.rmtree(aside)
-        else:
-            os.replace(temporary, path)
     except OSError as error:
         raise CampaignError(f"{target}: cannot be written: {error.strerror or error}") from error
-    finally:
-        if temporary.is_dir():
-            shutil.rmtree(temporary)
-        else:
-            temporary.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -259,7 +259,7 @@ def _document(model: GyroModel, estimate: Estimate | None) -> dict[str, Any]:
             if isinstance(value, tuple | int | str):
                 entry[name] = list(value) if isinstance(value, tuple) else value
             elif np.isfinite(float(value)):
-                entry[name] = exact_text(float(value), _setting_unit(effect, name, record))
+                entry[name] = exact_text(float(value), setting_unit(effect, name, record))
         fixed = [name for name in effect.declared() if (effect.label, name) in model.fixed]
         if fixed:
             entry["fixed"] = True if len(fixed) == len(effect.declared()) else fixed
@@ -306,7 +306,8 @@ def _unit_of(effect: Effect, name: str, record: Record | None) -> str:
     return effect.declared()[name].unit
 
 
-def _setting_unit(effect: Effect, name: str, record: Record | None) -> str:
+def setting_unit(effect: Effect, name: str, record: Record | None) -> str:
+    """The unit a setting is written in."""
     if not isinstance(effect, BiasColumn):
         return SETTING_UNITS[name]
     unit = record.units.get(effect.column, "") if record else ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -240,6 +241,51 @@ def test_a_full_disk_leaves_what_is_there(tmp_path: Path, monkeypatch: pytest.Mo
     assert here(tmp_path).campaigns == 4
 
 
+LOST = """
+import gc, signal
+from gyromodel import _archive_files, cli
+def interrupt(*_):
+    gc.callbacks.remove(interrupt)
+    signal.raise_signal(signal.SIGINT)
+def run(*arguments, whole=_archive_files.run_batch, **options):
+    gc.callbacks.append(interrupt)
+    return whole(*arguments, **options)
+_archive_files.run_batch = run
+cli.main()
+"""
+
+
+def test_ctrl_c_within_the_garbage_collector_counts(tmp_path: Path):
+    """Python drops what is raised in its callbacks, and JAX has one."""
+    archive(tmp_path, 2)
+    options = ["batch", str(tmp_path / "archive"), "--model", str(tmp_path / "model.yaml"), "-o", "results.parquet"]
+    done = subprocess.run(
+        [sys.executable, "-c", LOST, *options], capture_output=True, text=True, check=False, cwd=tmp_path
+    )
+    assert done.returncode == 130, done.stderr
+    assert re.fullmatch("gyromodel: interrupted; .*\n", done.stderr)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_ctrl_c_ends_in_one_sentence(tmp_path: Path, workers: str):
+    """In a terminal it goes to the workers, too."""
+    archive(tmp_path, 24)
+    command = [sys.executable, "-m", "gyromodel", "batch", str(tmp_path / "archive"), "--workers", workers]
+    options = ["--model", str(tmp_path / "model.yaml"), "-o", str(tmp_path / "results.parquet")]
+    process = subprocess.Popen([*command, *options], stderr=subprocess.PIPE, text=True, start_new_session=True)
+    parts = tmp_path / ".results.parquet.parts"
+    while process.poll() is None and not list(parts.glob("*.parquet")):
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGINT)
+    said = process.communicate(timeout=60)[1]
+    assert process.returncode == 130, said
+    assert re.fullmatch("gyromodel: interrupted; .*\n", said)
+    status, result = batch(tmp_path)
+    assert (status, result["campaigns"]) == (0, 24)
+    assert 0 < int(str(result["examined"])) < 24
+
+
 @pytest.mark.long
 def test_a_worker_that_dies_loses_nothing(tmp_path: Path):
     """Of a local cluster of two processes, one is killed when the first results are there."""
@@ -392,3 +438,27 @@ def test_a_scheduler_that_is_not_there_is_said(tmp_path: Path):
     assert status == 1
     assert "no Dask scheduler answers" in str(result["said"])
     assert os.listdir(tmp_path / ".results.parquet.parts") == ["lock"]
+
+
+def test_biases_of_an_archive_are_of_one_temperature(tmp_path: Path):
+    """Of like gyros measured at other temperatures, and whatever is measured later."""
+    place = tmp_path / "archive"
+    place.mkdir()
+    (tmp_path / "model.yaml").write_text(STATED)
+
+    def measured(k: int, name: str):
+        warmer = np.array(campaign(k).columns["temperature"]) + 10 * k
+        output = campaign(k).columns["output"] + 0.2 * 10 * k
+        changed = campaign(k).with_column("temperature", warmer, "degC").with_column("output", output, "deg/h")
+        write_campaign(changed, place / name)
+
+    for k in range(4):
+        measured(k, f"c{k}.csv")
+    first = here(tmp_path)
+    assert set(first.references) == {"bias_temperature"}
+    measured(5, "a5.csv")
+    done = here(tmp_path)
+    assert (done.examined, done.references) == (1, first.references)
+    found = [row for row in done.table.to_pylist() if row["parameter"] == "bias.value"]
+    expected = 3 + 0.2 * (first.references["bias_temperature"][0] - 20)
+    assert max(abs(row["value"] - expected) / row["std"] for row in found) < 5

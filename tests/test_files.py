@@ -5,6 +5,8 @@ from __future__ import annotations
 import gzip
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,7 @@ from hypothesis import strategies as st
 
 from gyromodel._checks import CampaignError
 from gyromodel.campaign import LARGEST, Campaign
-from gyromodel.files import read_campaign, write_campaign
+from gyromodel.files import read_campaign, replacing, write_campaign
 from tests.helpers import MUTANTS, SHARED_FOLDER, mutated, small_campaign
 
 FORMATS = (".csv", ".csv.gz", ".parquet", ".nc", ".zarr")
@@ -110,6 +112,26 @@ def test_a_failed_write_leaves_what_was_there(tmp_path: Path, monkeypatch: pytes
         write_campaign(small_campaign(serial="008"), path)
     assert os.listdir(tmp_path) == ["a.csv"]
     assert read_campaign(path).equals(small_campaign())
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".zarr"])
+def test_what_a_killed_write_left_goes_with_the_next(tmp_path: Path, suffix: str):
+    """Of the same target only, and not what another run is writing."""
+    path = tmp_path / f"a{suffix}"
+    kill = "import os, sys; from pathlib import Path; from gyromodel.files import replacing; "
+    kill += "f = replacing(Path(sys.argv[1])); f.__enter__().mkdir(); os.kill(os.getpid(), 9)"
+    subprocess.run([sys.executable, "-c", kill, str(path)], check=False)
+    [left] = tmp_path.iterdir()
+    others = {tmp_path / ".b.csv.01234567.tmp", tmp_path / f".a{suffix}.notes.tmp"}
+    for other in others:
+        other.touch()
+    with replacing(tmp_path / "c.csv") as writing:
+        writing.touch()
+        write_campaign(small_campaign(), path)
+        assert {*tmp_path.iterdir()} == {left, path, writing, *others}
+        (tmp_path / "c.csv").touch()
+    write_campaign(small_campaign(), path)
+    assert {*tmp_path.iterdir()} == {path, tmp_path / "c.csv", *others}
 
 
 def test_where_nothing_can_be_written(tmp_path: Path):

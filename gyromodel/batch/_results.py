@@ -8,6 +8,7 @@ import os
 import shutil
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -15,6 +16,7 @@ from typing import Any, Self
 import pyarrow as pa
 from pyarrow import parquet
 
+from gyromodel._atomic import sibling
 from gyromodel._checks import CampaignError
 from gyromodel.batch._archive import Entry
 
@@ -46,7 +48,7 @@ class Results:
 
     def __init__(self, path: Path, made_by: Mapping[str, str]) -> None:
         self.path, self.made_by = path, dict(made_by)
-        self._folder = path.with_name(f".{path.name}.parts")
+        self._folder = _parts_of(path)
         self._tables: list[pa.Table] = []
         self._waiting: list[dict[str, Any]] = []
         self._written = 0.0
@@ -150,6 +152,18 @@ class Results:
             return False
 
 
+def _parts_of(path: Path) -> Path:
+    return path.with_name(f".{path.name}.parts")
+
+
+def made_by_of(path: Path) -> dict[str, str]:
+    """What made a table, or the parts of one that is not finished; empty where there is none."""
+    for file in (path, *sorted(_parts_of(path).glob("*.parquet"))):
+        with suppress(pa.ArrowException, OSError):
+            return json.loads((parquet.read_schema(file).metadata or {}).get(MADE_BY, b"{}"))
+    return {}
+
+
 def read_results(path: Path) -> pa.Table:
     """A table of results.
 
@@ -168,12 +182,9 @@ def read_results(path: Path) -> pa.Table:
 
 def write_table(table: pa.Table, path: Path) -> None:
     """Whole or not at all, and on disk."""
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
+    with sibling(path) as temporary:
         with open(temporary, "wb") as file:
             parquet.write_table(table, file, compression="zstd")
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

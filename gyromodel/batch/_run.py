@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import logging
+import signal
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from itertools import zip_longest
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,8 +20,8 @@ import pyarrow as pa
 import gyromodel
 from gyromodel._checks import CampaignError
 from gyromodel.batch._archive import Entry, entries
-from gyromodel.batch._results import Results
-from gyromodel.batch._work import Lot, Row, examine, failed, read
+from gyromodel.batch._results import Results, made_by_of
+from gyromodel.batch._work import Lot, Row, examine, failed, open_references, read, with_references
 from gyromodel.model import GyroModel
 
 # Lots that wait at each worker, so that none is idle, and times that one may lose its worker.
@@ -32,12 +35,17 @@ RECENT = 60.0
 
 
 class Batch(NamedTuple):
-    """Results of an archive: the table, and how many campaigns there were, were examined in this run, and failed."""
+    """Results of an archive: the table, and how many campaigns there were, were examined in this run, and failed.
+
+    `references` holds the reference points that the model left open and all campaigns share, by effect: in internal
+    units, and as a text.
+    """
 
     table: pa.Table
     campaigns: int
     examined: int
     failed: int
+    references: dict[str, tuple[float, str]]
 
 
 def run_batch(
@@ -55,7 +63,8 @@ def run_batch(
 
     A campaign that cannot be read or fitted is a row with the reason. Campaigns that an earlier run has finished, and
     that have not changed since, are not examined again, unless the machine was at fault and not the data; those that
-    are gone from the archive leave the table.
+    are gone from the archive leave the table. Reference points that the model leaves open are those of the first
+    campaign in all, so that their parameters compare.
 
     Args:
         archive: see `entries`.
@@ -78,6 +87,12 @@ def run_batch(
         "version": gyromodel.__version__,
         "task": task,
     }
+    # As before: the first campaign may be another one now.
+    before = json.loads(made_by_of(results).get("references", "{}"))
+    references = {name: (value, text) for name, (value, text) in before.items()} or open_references(every, model)
+    if references:
+        made_by["references"] = json.dumps(references)
+        model = with_references(model, references)
     with Results(results, made_by) as kept:
         finished = kept.finished()
         states = {entry: entry.state for entry in every}
@@ -99,7 +114,7 @@ def run_batch(
         for name, status in zip(table["campaign"].to_pylist(), table["status"].to_pylist(), strict=True)
         if status == "failed"
     }
-    return Batch(table, len(every), len(todo), len(lost))
+    return Batch(table, len(every), len(todo), len(lost), references)
 
 
 def _parted(todo: Sequence[Entry], states: Mapping[Entry, str], most: int) -> Iterator[list[Entry]]:
@@ -131,10 +146,13 @@ def _on_cluster(lots: Sequence[Lot], workers: int, scheduler: str | None) -> Ite
     from dask.config import set as configured
     from distributed import Client, LocalCluster, as_completed
 
+    # Its warnings, and its tracebacks while it ends, are of no use to who waits for a table.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
     with configured({"distributed.scheduler.allowed-failures": LOST}), ExitStack() as open_ones:
         if scheduler is None:
             quiet = {"dashboard_address": "", "silence_logs": logging.CRITICAL}
-            cluster = open_ones.enter_context(LocalCluster(n_workers=workers, threads_per_worker=1, **quiet))
+            with _deaf_to_interrupts():
+                cluster = open_ones.enter_context(LocalCluster(n_workers=workers, threads_per_worker=1, **quiet))
         try:
             client = open_ones.enter_context(Client(scheduler or cluster, timeout=PATIENCE))
         except OSError:
@@ -160,6 +178,17 @@ def _on_cluster(lots: Sequence[Lot], workers: int, scheduler: str | None) -> Ite
             else:
                 yield lot, [failed(lot.heads()[0], future.exception())]
             running.update(submitted(1))
+
+
+@contextmanager
+def _deaf_to_interrupts() -> Iterator[None]:
+    """Threads and processes that begin here, and those that these begin, leave Ctrl-C to the main thread."""
+    resource_tracker.ensure_running()  # what starts it lets the signal through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 class _Pace:

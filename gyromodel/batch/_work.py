@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 import gyromodel
 from gyromodel._checks import CampaignError
+from gyromodel._yaml import exact_text
 from gyromodel.batch._archive import Entry
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis import diagnose
 from gyromodel.estimate import EstimateError, calibration_of, fit, fit_many, noise_table, read_for_fit
 from gyromodel.files import read_campaign
 from gyromodel.model import GyroModel, ModelError
+from gyromodel.model_files import setting_unit
 from gyromodel.signals import Record
 from gyromodel.units import UnitError
 
@@ -26,6 +30,43 @@ REFUSALS = (CampaignError, EstimateError, ModelError, UnitError)
 
 # Rows beyond which a campaign is fitted by itself: those fitted together are held in memory side by side.
 LONGEST = 1 << 16
+
+
+def open_references(every: Sequence[Entry], model: GyroModel) -> dict[str, tuple[float, str]]:
+    """Reference points that the model leaves open, by effect: those of the first campaign that has them.
+
+    With its own in each campaign, a bias would be that of another temperature every time.
+
+    Returns:
+        Each in internal units, and as a text.
+    """
+    unset = [effect.label for effect in model.effects if np.isnan(float(getattr(effect, "reference", 0.0)))]
+    for entry in every if unset else ():
+        try:
+            campaign = read_campaign(entry.path)
+            if len(campaign.outputs) > 1:
+                campaign = campaign.axis(campaign.outputs[0].removeprefix("output_"))
+            record = read_for_fit([campaign])
+            prepared = model.prepared(record.signals)
+        except Exception:
+            continue
+        found = [effect for effect in prepared.effects if effect.label in unset]
+        values = [float(effect.reference) for effect in found]
+        texts = [str(exact_text(v, setting_unit(e, "reference", record))) for e, v in zip(found, values, strict=True)]
+        if np.isfinite(values).all():
+            return dict(zip([effect.label for effect in found], zip(values, texts, strict=True), strict=True))
+    return {}
+
+
+def with_references(model: GyroModel, references: Mapping[str, tuple[float, str]]) -> GyroModel:
+    """The model with these reference points."""
+    effects = tuple(
+        eqx.tree_at(lambda e: e.reference, effect, jnp.asarray(references[effect.label][0]))
+        if effect.label in references
+        else effect
+        for effect in model.effects
+    )
+    return eqx.tree_at(lambda m: m.effects, model, effects)
 
 
 class Lot(NamedTuple):

@@ -117,7 +117,7 @@ def tornado_figure(found: Sensitivity) -> str:
     with draw.style():
         figure, _ = draw.blank()
         figure.clear()
-        shown = [r.budget for r in found.results if r.budget.std > 0 or r.budget.total > 0][:4]
+        shown = [r.budget for r in found.results if r.budget.std > 0 or r.budget.total > 0]
         counts = [len(_bars(budget)) for budget in shown]
         figure.set_size_inches(6.6, 0.3 + sum(0.28 * n + 0.85 for n in counts))
         panels = figure.subplots(len(shown), 1, squeeze=False, height_ratios=[n + 2 for n in counts])[:, 0]
@@ -157,7 +157,7 @@ def _tornado(axes: Axes, budget: Budget) -> None:
     axes.axvline(0.0, color=draw.INK, linewidth=0.8)
     axes.grid(visible=False, axis="y")
     title = budget.outcome.replace("_", " ")
-    axes.set_xlabel(draw.axis_label(f"{title} at ±1 standard uncertainty", budget.unit, power))
+    axes.set_xlabel(draw.axis_label(f"{title} at ±1 standard uncertainty", budget.unit, power), loc="right")
 
 
 def history_figure(found: Sensitivity) -> str:
