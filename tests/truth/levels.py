@@ -244,7 +244,10 @@ def amplitude_levels(records: list[Record]) -> list[Level]:
         hits = []
         for r in records:
             name = str(r.case.effect)
-            if r.case.times_mde == times and r.answer and r.score and r.score.named and name in SIZED:
+            # Coloured noise does not begin with the record: what it has come to by then is bias.
+            if name not in SIZED or (name == "bias" and r.case.noise in FAMILY[1:]):
+                continue
+            if r.case.times_mde == times and r.answer and r.score and r.score.named:
                 value, std = r.answer.sizes[name]
                 hits.append(bool(abs(value - SIZED[name] - r.truth.amplitude) <= 1.96 * std))
         levels.append(_level("16", f"95 % interval of the size, after selection, {times:g}×", "–", must, True, hits))
