@@ -370,6 +370,19 @@ def test_several_lines_are_one_cause(rng: np.random.Generator) -> None:
     assert frequency == pytest.approx([0.0031, 0.0117], abs=tolerance)
 
 
+def test_a_further_line_is_contested_by_its_other_names(rng: np.random.Generator) -> None:
+    """At a constant rate an error of the ramp's codes is a line; one that is nothing else stands beside it."""
+    time = 0.1 * np.arange(3000)
+    code = np.floor(time * 167.1) % 16384
+    wrong = 5.5 * np.cos(2 * np.pi * code / 16384) + 0.6 * np.sin(2 * np.pi * 0.217 * time)
+    columns = {"time": time, "feedback_ramp": code, "output": 5 + wrong + rng.normal(size=len(time))}
+    log = gm.Campaign(columns, {"time": "s", "feedback_ramp": "count", "output": "deg/h"}, {"kind": "rate"})
+    found = gm.diagnose(log, gm.model_from_effects(["bias"]), hold_out=False)
+    assert {c.effect for c in found.causes} == {"bias_periodic", "bias_readout_code"}
+    lines = next(e for e in found.extended.model.effects if e.label == "bias_periodic")
+    assert lines.frequency == pytest.approx([0.217], abs=1e-3)  # type: ignore[attr-defined]
+
+
 @pytest.mark.long
 def test_many_gross_errors_are_given_up_together(rng: np.random.Generator) -> None:
     """More of them than the search has rounds, beside a bias over temperature."""

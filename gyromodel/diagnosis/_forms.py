@@ -67,13 +67,14 @@ def _periodic(lines: Sequence[Line]) -> BiasPeriodic:
 
 
 def _lines(scanner: Scanner, ranking: Ranking, model: GyroModel) -> list[Line]:
-    """The best line and others in the same pass that stand by themselves."""
+    """The best line and others in the same pass that stand by themselves: ahead of all that may explain them."""
     assert scanner.lines is not None
     result = ranking.results[ranking.best_cell("bias_periodic")]
     form, explained, _ = result.best["bias_periodic"]
     assert isinstance(form, int)
     chosen = {form: explained}
     count, nu = len(scanner.lines.unseen), scanner.degrees_of_freedom
+    rival = max((v for k, v in result.evidence.items() if k not in ("bias_periodic", "outliers")), default=0.0)
     for k, t in sorted(result.peaks.items(), key=lambda item: -item[1]):
         if min(abs(k - j) for j in chosen) < RESOLVED:
             continue
@@ -81,7 +82,7 @@ def _lines(scanner: Scanner, ranking: Ranking, model: GyroModel) -> list[Line]:
         # is the grid's).
         leakage = sum(other / (0.25 * np.pi * abs(k - j)) ** 2 for j, other in chosen.items())
         alone = float(log_evidence_ratio(np.array(t), result.rss, nu, 2)) - np.log(count)
-        if alone > LINE_MARGIN and t > ABOVE_LEAKAGE * leakage:
+        if alone > LINE_MARGIN + max(rival, 0.0) and t > ABOVE_LEAKAGE * leakage:
             chosen[k] = t
     room = max(MAXIMUM_LINES * scanner.runs - len(lines_of(model)), 1)
     return [scanner.lines.line(k) for k in list(chosen)[:room]]
