@@ -51,7 +51,7 @@ def open_references(every: Sequence[Entry], model: GyroModel) -> dict[str, tuple
         except Exception:
             continue
         found = [effect for effect in prepared.effects if effect.label in unset]
-        values = [float(effect.reference) for effect in found]
+        values = [float(effect.reference) for effect in found]  # type: ignore[attr-defined]
         texts = [str(exact_text(v, setting_unit(e, "reference", record))) for e, v in zip(found, values, strict=True)]
         if np.isfinite(values).all():
             return dict(zip([effect.label for effect in found], zip(values, texts, strict=True), strict=True))
