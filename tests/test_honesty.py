@@ -172,6 +172,28 @@ def test_campaigns_that_no_number_tells_apart_have_no_steps_of_their_own(rng: np
     assert not {"bias_step", "bias_periodic"} & set(found.searched)
 
 
+def test_one_axis_of_three_is_to_be_named(rng: np.random.Generator) -> None:
+    alone = gm.Campaign(
+        {"time": TIME, "output_x": rng.normal(size=ROWS)}, {"time": "s", "output_x": "deg/h"}, {"kind": "rate"}
+    )
+    with pytest.raises(gm.CampaignError, match="has outputs output_x; choose one axis"):
+        gm.diagnose(alone, gm.model_from_effects(["bias"]))
+
+
+def test_a_bias_over_the_speed_of_temperature_whatever_its_sign_is_unknown(rng: np.random.Generator) -> None:
+    time = 30.0 * np.arange(1440)
+    hours = [0, 1, 2, 3.33, 5, 6.67, 7.78, 9.44, 10, 12]
+    true = np.interp(time / 3600, hours, [20, 20, 60, 60, -20, -20, 30, 30, 55, 55])
+    true = np.convolve(np.pad(true, 15, mode="edge"), np.ones(31) / 31, mode="valid")
+    speed = np.abs(np.gradient(true, time))
+    output = 7 * speed / speed.max() + rng.normal(size=1440)
+    measured = campaign(output, time, temperature=true + 0.01 * rng.normal(size=1440))
+    found = gm.diagnose(measured, gm.model_from_effects(["bias", "bias_temperature"]))
+    assert found.verdict == "unknown"
+    assert found.driver is not None
+    assert found.driver.column == "d(temperature)/dt"
+
+
 def test_a_column_may_share_the_name_of_an_effect(rng: np.random.Generator, tmp_path) -> None:
     drift = rng.normal(size=ROWS)
     found = gm.diagnose(

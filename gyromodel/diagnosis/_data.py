@@ -87,14 +87,13 @@ def _of_gyro(measured: Sequence[Campaign]) -> Data:
     ]
     findings += [line for of in (steps_of_output, stretch_still) for c in given if (line := of(c))]
     searched = tuple(c for c, _ in shortened)
+    record = read_signals(searched)
     output_unit = campaigns[0].units["output"]
     if campaigns[0].metadata["kind"] != "rate":
         output_unit = f"{output_unit}/s"
     whole = searched[0] if len(searched) == 1 else _together(searched)
     rows_of = tuple((c, c is m) for c, m in zip(searched, measured, strict=True))
-    return Data(
-        read_signals(searched), searched, rows_of, whole, tuple(findings), _rate_unit(campaigns[0]), output_unit
-    )
+    return Data(record, searched, rows_of, whole, tuple(findings), _rate_unit(campaigns[0]), output_unit)
 
 
 def _rate_unit(campaign: Campaign) -> str:

@@ -22,9 +22,9 @@ from gyromodel.diagnosis._points import dwells_apart
 from gyromodel.diagnosis._ranking import Ranking, cells_of_weight, is_driver, is_noise, noise_kinds
 from gyromodel.diagnosis._result import Candidate, Cause, Diagnosis, Gain, ParameterValue, Round
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._search import Progress, Selection, search
+from gyromodel.diagnosis._search import Progress, Selection, search, significant_driver
 from gyromodel.diagnosis._shapes import driver_shape, minimum_detectable, not_testable
-from gyromodel.diagnosis._steps import Found, NoisePath, Steps, standing
+from gyromodel.diagnosis._steps import EXCHANGE, Found, NoisePath, Steps, standing
 from gyromodel.diagnosis._variance import follow, growing_noise, noise_level, tails, with_variance
 from gyromodel.diagnosis._verdict import judge, structured, with_noise
 from gyromodel.estimate import Estimate, EstimateError, check_covariates, fit_record, with_noise_intervals
@@ -63,8 +63,12 @@ class _Session:
             now, before = self.ladder(selection.estimates[i]), self.ladder(selection.estimates[first])
             if first and not step.paired and step.effect is not None and now[0] > before[0] and now[1] < before[1]:
                 path, estimates = selection.path[:first], selection.estimates[: first + 1]
-                found = tuple(standing(path))
-                return Selection(estimates[-1], found, path, step.ranking, estimates, None, remains=step.name)
+                found, ranking = tuple(standing(path)), step.ranking
+                # What was cut may have stood for a driver that was ahead of it.
+                driver = significant_driver(ranking, self.threshold, self.scanner.runs)
+                if driver and ranking.statistic[driver] < ranking.statistic[step.name] + EXCHANGE:
+                    driver = None
+                return Selection(estimates[-1], found, path, ranking, estimates, driver, remains=step.name)
         return selection
 
 

@@ -110,7 +110,7 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
             ranking = steps.rank(estimates[-1], found)
             name, score = ranking.best(drivers=False, but=("bias_periodic",))
             remains = remains or (str(name) if score >= threshold else "")
-    driver = _significant_driver(ranking, threshold, scanner.runs)
+    driver = significant_driver(ranking, threshold, scanner.runs)
     return Selection(
         estimates[-1], tuple(found), tuple(path), ranking, tuple(estimates), driver, left_out, remains, small
     )
@@ -162,7 +162,7 @@ def _together(steps: Steps, path: list[Found], estimate: Estimate, ranking: Rank
     return [] if both is None else [(one, first), (other, both)]
 
 
-def _significant_driver(ranking: Ranking, threshold: float, runs: int) -> str | None:
+def significant_driver(ranking: Ranking, threshold: float, runs: int) -> str | None:
     """The leading smooth driver, if it is significant; for one of time beside slow noise, over what a walk makes."""
     driver, score = ranking.best(drivers=True)
     like_a_walk = driver == "smooth(time)" and runs < 2 and ranking.slow_noise
