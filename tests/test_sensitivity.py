@@ -25,6 +25,7 @@ from gyromodel.estimate import Calibration, fit
 from gyromodel.model import GyroModel, ModelError, simulate
 from gyromodel.model_files import write_model
 from gyromodel.numerics.uncertain import Uncertain
+from gyromodel.report import plan_sentence
 from gyromodel.study import (
     OUTCOMES,
     Instrument,
@@ -305,6 +306,19 @@ def test_rivals_are_told_apart_by_the_plan_that_parts_them_most(seed: int):
             change = misfit(wrong, y) - misfit(right, y)
             mean.append((change.mean(), change.std() / 20))
         assert min(m for m, _ in mean) == pytest.approx(plan.separation**2, abs=5 * max(e for _, e in mean))
+
+
+def test_a_plan_beside_one_that_tells_nothing_apart_has_no_ratio():
+    """Each soak in turn fills the time, and leaves none for the ramp that shows a slope over the rate."""
+    courses = {"cold": np.full(ROWS, 20.0), "warm": np.full(ROWS, 60.0), "ramp": RAMP}
+    parts = [Part(name, ROWS * STEP, mission(temperature=course)) for name, course in courses.items()]
+    calibration = Calibration(GyroModel((Bias(),), {"noise_white": 3e-4}), np.array([[1.0]]))
+    rivals = [BiasTemperature.id, BiasTemperatureRate.id]
+    choice = best_plan(known(calibration), parts, 2 * ROWS * STEP, "discrimination", rivals=rivals)
+    assert choice.equal.times == {"cold": 1, "warm": 1}
+    assert choice.gain == np.inf
+    said = plan_sentence(choice)
+    assert f"lie {choice.best.separation:.3g} standard deviations apart; each part in turn does not" in said
 
 
 def test_a_changeover_takes_its_time_with_each_part(tmp_path: Path):

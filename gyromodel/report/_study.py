@@ -99,9 +99,13 @@ def plan_sentence(choice: PlanChoice) -> str:
     what = {
         "parameters": "Intervals of the parameters are {:.2f} times narrower",
         "outcome": "The outcome's interval is {:.2f} times narrower",
-        "discrimination": "The rivals lie {:.2f} times further apart",
-    }[choice.criterion].format(choice.gain)
-    return f"Best plan ({choice.best.duration / 3600:.3g} h): {parts}. {what} than by each part in turn."
+        "discrimination": "The rivals, of typical size, lie {apart:.3g} standard deviations apart, {:.2f} times as far",
+    }[choice.criterion].format(choice.gain, apart=choice.best.separation)
+    than = "than" if choice.criterion != "discrimination" else "as"
+    best = f"Best plan ({choice.best.duration / 3600:.3g} h): {parts}."
+    if choice.gain == np.inf:
+        return f"{best} {what.rpartition(',')[0]}; each part in turn does not tell them apart."
+    return f"{best} {what} {than} by each part in turn."
 
 
 def _with_error(value: float, error: float) -> tuple[str, str]:
@@ -157,6 +161,7 @@ def _tornado(axes: Axes, budget: Budget) -> None:
     axes.axvline(0.0, color=draw.INK, linewidth=0.8)
     axes.grid(visible=False, axis="y")
     title = budget.outcome.replace("_", " ")
+    axes.locator_params(axis="x", nbins=7)
     axes.set_xlabel(draw.axis_label(f"{title} at ±1 standard uncertainty", budget.unit, power), loc="right")
 
 

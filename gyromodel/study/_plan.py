@@ -75,7 +75,7 @@ class PlanChoice(NamedTuple):
         best: that plan.
         equal: each part in turn for as long.
         gain: how many times narrower intervals are by the best plan, in the sense of the criterion; of a
-            discrimination how many times larger the separation is.
+            discrimination how many times larger the separation is, infinite where only the best has one.
     """
 
     criterion: Criterion
@@ -210,6 +210,8 @@ def best_plan(
         raise ModelError("the outcome has no uncertainty that a test could lessen")
     # Scores are ln det of the information, minus ln variance, and ln separation squared.
     gain = np.exp((after - before) / (2.0 * (count if criterion == "parameters" else 1)))
+    if criterion == "discrimination" and before <= np.log(LEAST):
+        gain = np.inf
     return PlanChoice(criterion, plan(best), plan(start), float(gain))
 
 
