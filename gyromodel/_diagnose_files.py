@@ -64,7 +64,11 @@ def diagnose_axes(
         raise CampaignError(f"no axis can be diagnosed; {'; '.join(f'{a}: {why}' for a, why in not_diagnosed.items())}")
     for axis, reason in not_diagnosed.items():
         print(f"gyromodel: axis {axis} was not diagnosed: {reason}", file=sys.stderr)
-    lie = triad(measured, extended)
+    # An error that no name explains may pass for a lean of its axis.
+    unknown = [axis for axis, result in axes.items() if result["verdict"] == "unknown"]
+    if unknown:
+        said.append(f"How the axes lie together is not told: what axis {unknown[0]} lacks has no name.")
+    lie = None if unknown else triad(measured, extended)
     result = {"axes": axes, "not_diagnosed": not_diagnosed, "triad": lie and lie.to_dict()}
     write_text(output / "axes.json", json_text(result))
     return result, "\n".join([*said, *([lie.sentence()] if lie else [])]), (*written, "axes.json")
