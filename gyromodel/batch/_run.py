@@ -150,7 +150,7 @@ def _on_cluster(lots: Sequence[Lot], workers: int, scheduler: str | None) -> Ite
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     with configured({"distributed.scheduler.allowed-failures": LOST}), ExitStack() as open_ones:
         if scheduler is None:
-            quiet = {"dashboard_address": "", "silence_logs": logging.CRITICAL}
+            quiet = {"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
             with _deaf_to_interrupts():
                 cluster = open_ones.enter_context(LocalCluster(n_workers=workers, threads_per_worker=1, **quiet))
         try:
