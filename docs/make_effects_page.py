@@ -15,6 +15,7 @@ SITES = {
     "gain": "The gain itself",
     "scale": "Terms of the scale-factor error ε",
     "rate": "Terms added to the input rate: bias, and what drives it",
+    "output": "Terms added to what all others come to",
     "angle": "Of a platform's vibration test: terms of the base's angle less that of the table",
 }
 HEAD = """# The effect catalogue
@@ -22,7 +23,7 @@ HEAD = """# The effect catalogue
 This page is generated from the code by `python docs/make_effects_page.py`. Effect names are those of model files,
 reports and JSON; `gyromodel effects ID` prints one entry in the terminal.
 
-    output = gain · (rate + Σ rate terms) · (1 + Σ scale terms) + noise
+    output = gain · (u + output terms) + noise, u = (rate + Σ rate terms) · (1 + Σ scale terms)
 
 of a gyro, and of a stabilised platform on a vibration table
 

@@ -47,7 +47,7 @@ class Slot(NamedTuple):
 
 
 class GyroModel(eqx.Module):
-    """output = Π gains · (rate + Σ rate terms) · (1 + Σ scale terms) + noise.
+    """output = Π gains · (u + output terms of u) + noise, u = (rate + Σ rate terms) · (1 + Σ scale terms).
 
     `noise` holds coefficients in internal units by noise id, or is empty for "estimate it"; `fixed` names the
     parameters that are known, as (effect label, field); `noise_of` says whether the noise is stated as that of a gyro's
@@ -173,9 +173,29 @@ class GyroModel(eqx.Module):
                 gain = gain * effect.value  # type: ignore[attr-defined]
             elif effect.site in ADDED:
                 rate = rate + effect.contribution(signals)
-            else:
+            elif effect.site == "scale":
                 scale = scale + effect.contribution(signals)
         return gain, rate, scale
+
+    def told(self, before: Float[Array | np.ndarray, " sample"], signals: Signals) -> Float[Array, " sample"]:
+        """What the output tells of (rate + Σ)(1 + Σ), both in rad/s."""
+        told = jnp.asarray(before)
+        for effect in self.effects:
+            if effect.site == "output":
+                told = told + effect.contribution({**signals, "rate": told})
+        return told
+
+    def passed(self, before: Float[Array | np.ndarray, " sample"], signals: Signals) -> Float[Array, " sample"]:
+        """Derivative of what is told by what would be: zero where the output ends."""
+        before = jnp.asarray(before)
+        return jax.jvp(lambda u: self.told(u, signals), (before,), (jnp.ones_like(before),))[1]
+
+    def ended(self, signals: Signals) -> np.ndarray:
+        """Samples at which the output ends and follows nothing."""
+        if all(effect.site != "output" for effect in self.effects):
+            return np.zeros(len(signals["time"]), bool)
+        _, rate, scale = self._sites(signals)
+        return np.asarray(self.passed(rate * scale, signals)) == 0.0
 
     def gain(self) -> Float[Array, ""]:
         """Output per unit of input rate."""
@@ -185,7 +205,7 @@ class GyroModel(eqx.Module):
     def predict(self, signals: Signals) -> Float[Array, " sample"]:
         """The noise-free output, in the campaign's internal output unit."""
         gain, rate, scale = self._sites(signals)
-        return gain * rate * scale
+        return gain * self.told(rate * scale, signals)
 
     def slope(self, signals: Signals) -> Float[Array, " sample"]:
         """Derivative of the output by the input rate at each sample: what turns an output error into a rate error.
@@ -202,9 +222,12 @@ class GyroModel(eqx.Module):
     def columns_of(self, effect: Effect, signals: Signals) -> Float[Array, "sample coefficient"]:
         """Derivative of the output by an effect's linear coefficients, as it stands in this model or were it added."""
         gain, rate, scale = self._sites(signals)
+        before = rate * scale
         if effect.site == "gain":
-            return (rate * scale * gain / effect.value)[:, None]  # type: ignore[attr-defined]
-        weight = gain * scale if effect.site in ADDED else gain * rate
+            return (self.told(before, signals) * gain / effect.value)[:, None]  # type: ignore[attr-defined]
+        if effect.site == "output":
+            return gain * effect.columns({**signals, "rate": before})
+        weight = gain * self.passed(before, signals) * (scale if effect.site in ADDED else rate)
         return weight[:, None] * effect.columns(signals)
 
     def steady_columns(self, signals: Signals) -> dict[int, np.ndarray]:
@@ -212,7 +235,7 @@ class GyroModel(eqx.Module):
         return {
             i: np.asarray(evaluate(effect, signals)[0])
             for i, effect in enumerate(self.effects)
-            if effect.site != "gain" and all(declared.linear for declared in effect.declared().values())
+            if effect.site not in ("gain", "output") and all(each.linear for each in effect.declared().values())
         }
 
     def linearise(
@@ -224,31 +247,38 @@ class GyroModel(eqx.Module):
         """
         rate = on_host(signals.get("rate", jnp.zeros_like(signals["time"])))
         scale = 1.0 + 0.0 * rate
-        pieces = []
+        pieces: dict[int, Any] = {}
         for i, effect in enumerate(self.effects):
+            if effect.site in ("gain", "output"):
+                continue
             if steady is not None and i in steady:
-                pieces.append((steady[i], None, steady[i] @ on_host(effect.linear())))
+                pieces[i] = [steady[i], steady[i][:, :0], steady[i] @ on_host(effect.linear())]
             else:
-                pieces.append(None if effect.site == "gain" else [on_host(x) for x in evaluate(effect, signals)])
-        for effect, piece in zip(self.effects, pieces, strict=True):
-            if piece is not None and effect.site in ADDED:
-                rate = rate + piece[2]
-            elif piece is not None:
-                scale = scale + piece[2]
-        gain = on_host(self.gain())
-        prediction = gain * rate * scale
-        by_rate, by_scale = gain * scale, gain * rate
+                pieces[i] = [on_host(x) for x in evaluate(effect, signals)]
+            if effect.site in ADDED:
+                rate = rate + pieces[i][2]
+            else:
+                scale = scale + pieces[i][2]
+        gain, told, passed = on_host(self.gain()), rate * scale, 1.0
+        for i, effect in enumerate(self.effects):
+            if effect.site == "output":
+                passed = on_host(self.passed(told, signals))
+                pieces[i] = [on_host(x) for x in evaluate(effect, {**signals, "rate": jnp.asarray(told)})]
+                told = told + pieces[i][2]
+        prediction = gain * told
+        by = {"scale": gain * rate * passed, "output": gain + 0.0 * rate}
+        by |= dict.fromkeys(ADDED, gain * scale * passed)
         columns = []
         for i, name in self._fields():
-            effect, piece = self.effects[i], pieces[i]
-            if piece is None:
+            effect = self.effects[i]
+            if effect.site == "gain":
                 columns.append((prediction / on_host(effect.value))[:, None])  # type: ignore[attr-defined]
                 continue
             linear = effect.declared()[name].linear
             alike = [k for k, declared in effect.declared().items() if declared.linear == linear]
             first = sum(np.size(getattr(effect, k)) for k in alike[: alike.index(name)])
-            part = piece[0 if linear else 1][:, first : first + np.size(getattr(effect, name))]
-            columns.append((by_rate if effect.site in ADDED else by_scale)[:, None] * part)
+            part = pieces[i][0 if linear else 1][:, first : first + np.size(getattr(effect, name))]
+            columns.append(by[effect.site][:, None] * part)
         if not columns:
             return prediction, np.zeros((prediction.shape[0], 0))
         return prediction, (np if isinstance(prediction, np.ndarray) else jnp).concatenate(columns, axis=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -183,10 +184,10 @@ def _read_setting(place: Place, effect: Effect, name: str) -> Any:
     if isinstance(default, tuple | int):
         places = place.items(name) if isinstance(default, tuple) else [place]
         texts = [p.text() for p in places]
-        if isinstance(default, tuple) and all(isinstance(each, str) for each in default):
+        if isinstance(default, tuple) and "str" in next(str(f.type) for f in fields(effect) if f.name == name):
             return tuple(texts)
-        if not all(re.fullmatch(r"[-+]?\d{1,2}", text) for text in texts):
-            raise place.error(f"{name} takes whole numbers below 100")
+        if not all(re.fullmatch(r"[-+]?\d{1,3}", text) for text in texts):
+            raise place.error(f"{name} takes whole numbers below 1000")
         numbers = tuple(int(text) for text in texts)
         return numbers if isinstance(default, tuple) else numbers[0]
     return place.quantity()[0] if isinstance(effect, BiasColumn) else place.number_in(SETTING_UNITS[name])

@@ -25,7 +25,7 @@ from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores
 from gyromodel.diagnosis._evidence import SIZES, explained_for, log_evidence_ratio
 from gyromodel.diagnosis._pairs import best_pair
-from gyromodel.diagnosis._ranking import rank
+from gyromodel.diagnosis._ranking import EASE, ease, rank
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._verdict import _as_set, _places
 from gyromodel.effects.thermal import BiasWarmup
@@ -33,6 +33,7 @@ from gyromodel.estimate import EstimateError, fit_record
 from gyromodel.model import record_span
 from gyromodel.noise import NoiseGrid, NoiseRatios, markov_sum
 from gyromodel.signals import read_signals
+from tests.truth import study
 
 ROWS = 256
 
@@ -381,6 +382,44 @@ def test_a_further_line_is_contested_by_its_other_names(rng: np.random.Generator
     assert {c.effect for c in found.causes} == {"bias_periodic", "bias_readout_code"}
     lines = next(e for e in found.extended.model.effects if e.label == "bias_periodic")
     assert lines.frequency == pytest.approx([0.217], abs=1e-3)  # type: ignore[attr-defined]
+
+
+# Weak effects beside which one of a thousand lines, or of as many steps, explains as much by chance.
+WEAK = [
+    study.Case(4486955809305969, "static_cycle", "white", "bias_pressure", 1.0),
+    study.Case(706866630942447, "static_cycle", "random_walk", "bias_supply_voltage", 1.0),
+    study.Case(4237361959852665, "turntable", "flicker", "bias_magnetic", 1.0),
+]
+
+
+@pytest.mark.parametrize("case", WEAK, ids=lambda case: case.effect)
+def test_a_name_is_the_same_only_as_what_holds_its_signal(case: study.Case) -> None:
+    answer = study.run_engine(study.build(case))
+    assert answer.verdict == "named"
+    assert answer.causes == (case.effect,)
+
+
+@pytest.mark.parametrize(("name", "less"), [("bias_temperature", EASE), ("bias_drift", 0.0), ("smooth(time)", 0.0)])
+def test_a_name_needs_less_where_no_random_walk_is_beside_it(name: str, less: float) -> None:
+    assert ease(name, walks=False) == less
+    assert ease(name, walks=True) == 0.0
+
+
+def test_higher_harmonics_of_a_code_are_no_lines(rng: np.random.Generator, tmp_path) -> None:
+    """The error of a bit has harmonics far beyond the series searched; at a constant rate each is a line."""
+    time = 0.1 * np.arange(3000)
+    code = np.floor(time * 967.1) % 16384
+    wrong = 4.0 * np.cos(2 * np.pi * code / 16384) + 2.0 * ((code * 24 // 16384) % 2)
+    columns = {"time": time, "feedback_ramp": code, "output": 5 + wrong + rng.normal(size=len(time))}
+    log = gm.Campaign(columns, {"time": "s", "feedback_ramp": "count", "output": "deg/h"}, {"kind": "rate"})
+    found = gm.diagnose(log, gm.model_from_effects(["bias"]), hold_out=False)
+    assert [c.effect for c in found.causes] == ["bias_readout_code"]
+    coded = found.extended.model.effects[1]
+    period = float(coded.period) / 16384  # type: ignore[attr-defined]
+    assert {12, 36} <= {round(k / period) for k in coded.harmonics}  # type: ignore[attr-defined]
+    gm.write_model(found.extended, tmp_path / "extended.yaml")
+    again = gm.read_model(tmp_path / "extended.yaml").effects[1]
+    assert again.harmonics == coded.harmonics  # type: ignore[attr-defined]
 
 
 @pytest.mark.long

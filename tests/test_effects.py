@@ -140,7 +140,7 @@ def test_declarations_are_complete(label: str):
     assert re.search(r"[=≡]", equation), "the docstring opens with the equation"
     for sentence in (effect.cause, effect.test):
         assert re.fullmatch(r"[A-Z].{15,}\.", sentence)
-    assert effect.site in ("gain", "scale", "rate")
+    assert effect.site in ("gain", "scale", "rate", "output")
     for name, declared in effect.declared().items():
         assert declared.meaning
         assert declared.typical > 0
@@ -406,7 +406,7 @@ def test_equation_by_hand(label: str, fields: dict[str, str], columns: dict[str,
     effect = type(effect)(**{k: jnp.asarray(internal(v)) for k, v in fields.items()}, **SETTINGS.get(label, {}))
     signals = {"time": jnp.zeros(len(expected))} | {k: jnp.asarray(v) for k, v in columns.items()}
     effect = effect.prepared(signals) if "temperature_coil" in signals else effect
-    unit = DEG_H if effect.site == "rate" else 1e-6
+    unit = DEG_H if effect.site in ("rate", "output") else 1e-6
     assert np.asarray(effect.contribution(signals)) / unit == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 

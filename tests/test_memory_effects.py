@@ -168,6 +168,23 @@ def test_a_clipped_output_is_saturation():
     assert told.value == pytest.approx(np.rad2deg(limit), abs=max(5 * told.std, 1e-3))
 
 
+def test_an_output_that_ends_has_its_errors_before_the_end():
+    """Bias and scale move the rate at which a converter ends, not what it tells there."""
+    rng = np.random.default_rng(EXAMPLE)
+    design = DESIGNS["rate_temperature"](rng)
+    rate, warmer = np.rad2deg(design.true["rate"]), design.true["temperature"] - 25.0
+    limit = rng.uniform(0.6, 0.85) * rate.max()
+    output = clipped((rate + 0.2) * (1.0 + 2e-4 * warmer), limit) + 1e-3 * rng.standard_normal(len(rate))
+    found = gm.diagnose(
+        campaign_of(design, output, "deg/s"), gm.model_from_effects(["scale_factor", "bias"]), hold_out=False
+    )
+    assert found.verdict == "named"
+    assert {c.effect for c in found.causes} == {"saturation", "scale_temperature"}
+    gain = float(found.extended.model.gain())
+    told = next(p for c in found.causes if c.effect == "saturation" for p in c.parameters if p.name == "limit")
+    assert gain * told.value == pytest.approx(limit, abs=0.002)
+
+
 @pytest.mark.parametrize(("quantum", "said"), [(0.05, True), (2.0**-4, True), (1e-3, False)])
 def test_steps_of_the_output_are_said_of(quantum: float, said: bool, rng: np.random.Generator):
     """A converter of whole numbers under noise of 0.05 deg/s; one much finer than the noise is nobody's concern."""

@@ -365,7 +365,7 @@ BAD = [
     (entry("{effect: scale_nonlinearity, powers: [1]}"), 4, "scale_nonlinearity: "),
     (entry("{effect: scale_nonlinearity, powers: [2, 3], coefficients: [3 ppm]}"), 4, "scale_nonlinearity: "),
     (entry("{effect: scale_spline, knots: 2}"), 4, "scale_spline: "),
-    (entry("{effect: scale_spline, knots: 1000000000}"), 4, "whole numbers below 100"),
+    (entry("{effect: scale_spline, knots: 1000000000}"), 4, "whole numbers below 1000"),
     (entry("{effect: scale_spline, knots: 6.5}"), 4, "whole numbers"),
     ("effects:\n  - {effect: bias_step, fixed: true}\n  - effect: bias_step\n", 3, "of several bias_step all have"),
     ("effects: []\nnoise: loud\n", 2, "noise is"),

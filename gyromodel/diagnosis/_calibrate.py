@@ -16,7 +16,7 @@ import numpy as np
 
 from gyromodel import __version__
 from gyromodel._cache import cache_folder
-from gyromodel.diagnosis._ranking import cells_of_weight, rank, skipped, tangents
+from gyromodel.diagnosis._ranking import EASE, cells_of_weight, ease, rank, skipped, tangents
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.estimate import Estimate, filter_of
 from gyromodel.numerics.state_space import colour
@@ -31,7 +31,9 @@ _draw = jax.jit(jax.vmap(colour, in_axes=(None, 0)))
 def null_scores(
     scanner: Scanner, baseline: Estimate, draws: int, seed: int, say: Callable[[str, float], None]
 ) -> np.ndarray:
-    """S = max ln B of each draw of the baseline's own noise, from the cache where this design has been drawn before.
+    """S of each draw of the baseline's own noise, from the cache where this design has been drawn before.
+
+    S is the largest ln B, with what a name needs less where the noise beside it has no random walk.
 
     Args:
         scanner: the search laid out on the record.
@@ -51,6 +53,7 @@ def null_scores(
         cells = cells_of_weight(rank(scanner, scanner.coarse_cells(), baseline, (), skip), WITHIN)
     filter = filter_of(scanner.record, baseline.ratios)
     prior = scanner.grid.log_prior[cells][:, None]
+    walks = np.asarray(scanner.grid.ratios.walk)[cells] > 0
     rng = np.random.default_rng(seed)
     scores = []
     for start in range(0, draws, DRAWS_TOGETHER):
@@ -59,8 +62,13 @@ def null_scores(
         batches = scanner.run_many(cells, columns, drawn, {}, tangents=continued)
         logs = np.stack([b.log_likelihood for b in batches]) + prior
         names = set.intersection(*(set(b.evidence) for b in batches)) - skip
-        each = [np.logaddexp.reduce(logs + np.stack([b.evidence[n] for b in batches])) for n in sorted(names)]
-        scores.append(np.max(each, axis=0) - np.logaddexp.reduce(logs))
+        null, each = np.logaddexp.reduce(logs), []
+        for name in sorted(names):
+            beside = logs + np.stack([b.evidence[name] for b in batches])
+            each.append(
+                np.logaddexp.reduce(beside) - null + np.where(walks[beside.argmax(axis=0)], 0.0, ease(name, False))
+            )
+        scores.append(np.max(each, axis=0))
         say("calibrating the threshold", 0.06 + 0.18 * min(1.0, (start + DRAWS_TOGETHER) / draws))
     found = np.concatenate(scores)[:draws]
     with suppress(OSError):
@@ -73,7 +81,7 @@ def null_scores(
 
 def _design(scanner: Scanner, baseline: Estimate, columns: np.ndarray, draws: int, seed: int) -> str:
     """A digest of all that the draws depend on; noise ratios to a fifth of a decade."""
-    digest = hashlib.sha256(f"{__version__} {baseline.model.labels} {scanner.stated} {draws} {seed}".encode())
+    digest = hashlib.sha256(f"{__version__} {EASE} {baseline.model.labels} {scanner.stated} {draws} {seed}".encode())
     sampling = scanner.record.sampling
     for part in (scanner.bank.columns, columns, scanner.present, sampling.interval, sampling.white):
         digest.update(np.round(np.asarray(part, float), 9).tobytes())

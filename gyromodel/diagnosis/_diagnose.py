@@ -14,12 +14,11 @@ from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores
 from gyromodel.diagnosis._data import read
 from gyromodel.diagnosis._evidence import SAFE_THRESHOLD
-from gyromodel.diagnosis._exchange import SLOW_IN_TIME
 from gyromodel.diagnosis._gain import ladder_error, nested_gain, no_gain, not_measured
 from gyromodel.diagnosis._isolation import settling_test
 from gyromodel.diagnosis._noise_causes import as_cause, quantisation, telegraph
 from gyromodel.diagnosis._points import dwells_apart
-from gyromodel.diagnosis._ranking import Ranking, cells_of_weight, is_driver, is_noise, noise_kinds
+from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, cells_of_weight, ease, is_driver, is_noise, noise_kinds
 from gyromodel.diagnosis._result import Candidate, Cause, Diagnosis, Gain, ParameterValue, Round
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import Progress, Selection, search, significant_driver
@@ -213,7 +212,7 @@ def diagnose(
         credible_set=judgement.credible_set,
         unexplained=judgement.unexplained,
         findings=(*findings, *judgement.findings),
-        threshold=session.threshold,
+        threshold=session.threshold - _eased(rankings[0]),
         threshold_kind="calibrated" if calibrate else "safe",
         p_value=_p_value(selection, nulls) if calibrate else None,
         searched=tuple(dict.fromkeys([*bank.names(), *(name for r in rankings for name in r.tangents)])),
@@ -280,10 +279,16 @@ def _like_hops(selection: Selection, free: Estimate) -> bool:
     return in_time and selection.driver in (None, "smooth(time)") and (slow or bool(selection.found))
 
 
+def _eased(first: Ranking) -> float:
+    """Nats that the leading name needed less."""
+    name, _ = first.best(drivers=False)
+    return ease(name, first.walks[first.best_cell(name)]) if name else 0.0
+
+
 def _p_value(selection: Selection, nulls: np.ndarray) -> float:
     """Share of campaigns with nothing hidden whose best candidate has as much evidence; this one is counted."""
     first = selection.path[0].ranking if selection.path else selection.last
-    return float((1 + np.sum(nulls >= first.score)) / (1 + len(nulls)))
+    return float((1 + np.sum(nulls >= first.significance)) / (1 + len(nulls)))
 
 
 def _gain(session: _Session, baseline: Estimate, selection: Selection, unit: str, scale: float, ordinary, say) -> Gain:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise
+from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, is_driver, is_noise
 from gyromodel.diagnosis._steps import EXCHANGE, Found, Steps, standing
 from gyromodel.estimate import Estimate
 
 # Lines that lead every other name by this much (nats) are not chosen again.
 LINE_LEAD = 20.0
-# Functions of time that one run cannot tell from a random walk, and the lead (nats) over it at which they are put
-# beside it.
-SLOW_IN_TIME = ("bias_drift", "bias_warmup", "bias_step")
+# The lead (nats) over a random walk at which what it imitates is put beside it.
 SLOW_LEAD = 3.5
 
 

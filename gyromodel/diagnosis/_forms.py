@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -15,6 +16,7 @@ from gyromodel.diagnosis._ranking import Ranking, is_noise
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._tangents import Tangent
 from gyromodel.effects import Effect
+from gyromodel.effects.converter import BiasReadoutCode
 from gyromodel.effects.drivers import BiasPeriodic, BiasStep
 from gyromodel.estimate import Estimate
 from gyromodel.model import GyroModel
@@ -26,6 +28,9 @@ MAXIMUM_LINES = 6
 ABOVE_LEAKAGE = 4.0
 # … and have this evidence (nats) by itself, the search over frequencies paid for.
 LINE_MARGIN = 8.0
+# Harmonics of twice a ramp, the evidence (nats) of a higher one by itself with the search paid for, and by how many
+# steps of the record's resolution it may not be off: of 33 shares of that, the middle ones.
+HARMONICS, HARMONIC_MARGIN, DETUNED, MIDDLE = 256, 4.0, 2.0, range(13, 20)
 # Part of the samples that may be given up because an effect does not know what was before them.
 MOST_UNKNOWN = 0.25
 
@@ -49,6 +54,8 @@ def addition(
     fixed = [e for e in estimate.model.effects if e.label == name and name in estimate.model.wholly_fixed()]
     effect = fixed[0] if fixed else form_effect(scanner, name, form)
     assert effect is not None
+    if isinstance(effect, BiasReadoutCode):
+        effect = _with_harmonics(scanner, estimate, effect, ranking.best_cell(name), pulses)
     if isinstance(effect, BiasPeriodic):
         effect = _periodic([*lines_of(estimate.model), *_lines(scanner, ranking, estimate.model)])
     for held in estimate.model.effects:
@@ -56,6 +63,61 @@ def addition(
     effect = _solved(scanner, estimate, effect, ranking.best_cell(name), pulses).settled()
     rows = np.flatnonzero(scanner.present & np.asarray(effect.unknown(scanner.record.signals)))
     return effect, tuple(map(int, rows)) if len(rows) < MOST_UNKNOWN * scanner.present.sum() else ()
+
+
+def _with_harmonics(
+    scanner: Scanner, estimate: Estimate, effect: BiasReadoutCode, g: int, pulses: tuple[int, ...]
+) -> BiasReadoutCode:
+    """The error of a code with the higher harmonics that stand out, each of which is a line where the rate is constant.
+
+    One that a slightly other frequency would explain better is a line of its own.
+    """
+    signals = scanner.record.signals
+    time, ramp = np.asarray(signals["time"]), np.asarray(signals["feedback_ramp"])
+    numbers = effect.harmonics or range(1, 1 + effect.cosine.size)
+    # All of them in one series, where the form found is a part of it.
+    parts = 2.0 * np.ptp(ramp[scanner.present]) / float(effect.period)
+    whole = round(parts) if np.isclose(parts, round(parts)) else 1
+    series = replace(effect, period=effect.period * whole)
+    numbers = [whole * k for k in numbers]
+    waves = series.with_harmonics(range(1, 1 + HARMONICS)).columns(signals)
+    w = _whitened(scanner, estimate.model, waves, g, pulses)
+    own, pairs, rest = np.split(w, [w.shape[1] - 1 - 2 * HARMONICS, w.shape[1] - 1], axis=1)
+    phasors = np.asarray(waves[:, :HARMONICS] + 1j * waves[:, HARMONICS:])
+    turns = 2.0 * np.pi * np.linspace(-DETUNED, DETUNED, 33) / np.ptp(time[scanner.present])
+    held, further = list(numbers), [k for k in range(1, 1 + HARMONICS) if k not in numbers]
+    while further:
+        known = [*(k - 1 for k in held), *(HARMONICS + k - 1 for k in held)]
+        taken = np.linalg.qr(np.column_stack([own, pairs[:, known]]))[0]
+        left = rest - taken @ (taken.T @ rest)
+        explained = _explained(
+            pairs[:, [k - 1 for k in further]], pairs[:, [HARMONICS + k - 1 for k in further]], taken, left
+        )
+        best = int(explained.argmax())
+        freedom = scanner.degrees_of_freedom - taken.shape[1]
+        evidence = log_evidence_ratio(explained, float(np.sum(left**2)), freedom, 2)[best]
+        if evidence < np.log(len(further)) + HARMONIC_MARGIN:
+            break
+        k = further.pop(best)
+        near = phasors[:, [k - 1]] * np.exp(1j * np.outer(time, turns))
+        cosines, sines = (scanner.cells.whiten(g, part) for part in (np.real(near), np.imag(near)))
+        if _explained(cosines, sines, taken, left).argmax() in MIDDLE:
+            held.append(k)
+    if len(held) == len(numbers):
+        return effect
+    common = math.gcd(*held)
+    return replace(series, period=series.period / common).with_harmonics(sorted(k // common for k in held))
+
+
+def _explained(cosines: np.ndarray, sines: np.ndarray, taken: np.ndarray, left: np.ndarray) -> np.ndarray:
+    """What each wave explains of what is left once others are taken."""
+    both = [part - taken @ (taken.T @ part) for part in (cosines, sines)]
+    return np.array(
+        [
+            np.sum((np.linalg.qr(np.stack(pair, axis=1))[0].T @ left) ** 2)
+            for pair in zip(*(b.T for b in both), strict=True)
+        ]
+    )
 
 
 def _periodic(lines: Sequence[Line]) -> BiasPeriodic:
@@ -128,13 +190,20 @@ def _coefficients(
     scanner: Scanner, model: GyroModel, columns: Array | np.ndarray, g: int, pulses: tuple[int, ...]
 ) -> Float[Array, " coefficient"]:
     """The coefficients of columns that fit best beside a model, in one noise cell."""
+    w = _whitened(scanner, model, columns, g, pulses)
+    norm = np.linalg.norm(w[:, :-1], axis=0)
+    norm[norm == 0] = 1.0
+    solution = np.linalg.lstsq(w[:, :-1] / norm, w[:, -1], rcond=1e-9)[0] / norm
+    return jnp.asarray(solution[-columns.shape[1] :])
+
+
+def _whitened(
+    scanner: Scanner, model: GyroModel, columns: Array | np.ndarray, g: int, pulses: tuple[int, ...]
+) -> np.ndarray:
+    """What a model's parameters and gross errors add, some columns, and its residual, white in one noise cell."""
     record = scanner.record
     predicted, jacobian = model.linearise(record.signals)
     residual = np.where(scanner.present, np.asarray(record.signals["output"]) - predicted, 0.0)
     marks = np.zeros((len(residual), len(pulses)))
     marks[list(pulses), np.arange(len(pulses))] = 1.0
-    w = scanner.cells.whiten(g, np.column_stack([jacobian, marks, columns, residual]))
-    norm = np.linalg.norm(w[:, :-1], axis=0)
-    norm[norm == 0] = 1.0
-    solution = np.linalg.lstsq(w[:, :-1] / norm, w[:, -1], rcond=1e-9)[0] / norm
-    return jnp.asarray(solution[-columns.shape[1] :])
+    return scanner.cells.whiten(g, np.column_stack([jacobian, marks, columns, residual]))

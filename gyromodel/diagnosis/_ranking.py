@@ -18,7 +18,7 @@ from gyromodel.effects import CATALOGUE
 from gyromodel.effects._base import evaluate
 from gyromodel.effects.drivers import BiasColumn
 from gyromodel.estimate import Estimate
-from gyromodel.model import GyroModel, effect_class
+from gyromodel.model import GyroModel
 from gyromodel.noise import markov_cells, restricted_likelihood
 
 # Cells within this many nats of the best, for any candidate that matters, get their neighbours searched too: those
@@ -26,8 +26,11 @@ from gyromodel.noise import markov_cells, restricted_likelihood
 NEARBY, HOPELESS = 7.0, 30.0
 # Prior odds (ln) of a Markov process against flicker and random walk of all sizes, absent ones too.
 MARKOV_PRIOR = np.log(0.2)
-# Candidates whose sums of squares differ by less than this part of the noise variance have the same signal.
-ALIKE = 0.2
+# Functions of time that one run cannot tell from a random walk.
+SLOW_IN_TIME = ("bias_drift", "bias_warmup", "bias_step")
+# Nats that the first name needs less where the noise beside it has no random walk: most of what noise imitates, a walk
+# does.
+EASE = 1.0
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,11 @@ class Ranking:
         """S: the best candidate's evidence ratio (ln)."""
         return max(self.statistic.values(), default=-np.inf)
 
+    @property
+    def significance(self) -> float:
+        """S with what each candidate needs less."""
+        return max((v + ease(k, self.walks[self.best_cell(k)]) for k, v in self.statistic.items()), default=-np.inf)
+
     def best_cell(self, name: str | None = None) -> int:
         """The noise cell of most weight, with a candidate added or with none."""
 
@@ -86,26 +94,11 @@ class Ranking:
         result = self.results[self.best_cell(name)]
         return result.best[name][1] / result.rss
 
-    def twins(self, name: str) -> set[str]:
-        """Effects that explain as much of the data as a candidate, with at most one coefficient more.
 
-        Their signals hold the candidate's: no size of it would tell them apart on this campaign. A form
-        that contains another which was searched is no twin: it follows whatever that one leaves. Nor is a step one of
-        a bias, which it becomes at an end of the record; fits tell what the shapes searched cannot.
-        """
-        if name in self.fitted:
-            return set()
-        result = self.results[self.best_cell(name)]
-        _, explained, q = result.best[name]
-        least = explained - ALIKE * (result.rss - explained) / self.samples
-        return {
-            k
-            for k, (_, t, width) in result.best.items()
-            if k not in (name, "outliers", "bias_step" if name == "bias" else "")
-            and k in self.statistic and not is_driver(k)
-            and width <= q + 1 and t >= least
-            and not result.best.keys() & set(effect_class(k).supersedes) - {k}
-        }  # fmt: skip
+def ease(name: str, walks: bool) -> float:
+    """Nats that a candidate needs less, by whether the noise beside it has a random walk."""
+    apart = is_driver(name) or is_noise(name) or name in (*SLOW_IN_TIME, "outliers")
+    return 0.0 if walks or apart else EASE
 
 
 def is_driver(name: str) -> bool:

@@ -124,8 +124,8 @@ class Scanner:
         self._lost = np.zeros(len(bank.blocks), bool)
         self.epochs, self._run_ends = epochs_of(record)
 
-    def without(self, rows: np.ndarray, cells: list[int]) -> Scanner:
-        """The same search on the record without some rows, in some of the noise cells.
+    def without(self, rows: np.ndarray, cells: list[int] | None) -> Scanner:
+        """The same search on the record without some rows, in some of the noise cells, or all.
 
         An effect's form is left out with the rows that told it: what hardly shows in the others says nothing of them.
         """

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from gyromodel.diagnosis._apart import like
 from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._evidence import log_evidence_ratio, log_sum
-from gyromodel.diagnosis._exchange import SLOW_IN_TIME, SLOW_LEAD, exchanged, unresolved
+from gyromodel.diagnosis._exchange import SLOW_LEAD, exchanged, unresolved
 from gyromodel.diagnosis._forms import MAXIMUM_LINES
 from gyromodel.diagnosis._lines import lines_of
 from gyromodel.diagnosis._pairs import best_pair
-from gyromodel.diagnosis._ranking import Ranking, rank, skipped
+from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, ease, rank, skipped
 from gyromodel.diagnosis._steps import EXCHANGE, Found, Steps, rows_of, standing
 from gyromodel.estimate import Estimate
 
@@ -65,7 +66,7 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
         lines = ranking.statistic.get("bias_periodic", -np.inf)
         remains = "bias_periodic" if full and lines >= threshold else ""
         name, score = ranking.best(drivers=False, but=("bias_periodic" if full else "", "" if path else avoid))
-        if name is None or (score < threshold and not _slow_structure(ranking, name, score, threshold, scanner.runs)):
+        if name is None or not _significant(steps, ranking, name, score, first=not path):
             both = _together(steps, path, estimate, ranking)
             if not both or len(path) + 2 > MAXIMUM_ROUNDS or any(unresolved(e, f, scanner.step) for f, e in both):
                 break
@@ -186,18 +187,23 @@ def _before(i: int, path: list[Found], estimates: list[Estimate]) -> Selection:
     )
 
 
-def like(ranking: Ranking, name: str, others: Sequence[str]) -> bool:
-    """Whether a candidate is one of some names, or explains the same data as one of them."""
-    if name in others or name == "outliers" or name not in ranking.results[ranking.best_cell(name)].best:
-        return name in others
-    return not ranking.twins(name).isdisjoint(others)
+def _significant(steps: Steps, ranking: Ranking, name: str, score: float, *, first: bool) -> bool:
+    """Whether a name is to be added; what would be the first needs less where no walk is beside it."""
+    if score >= steps.threshold:
+        return True
+    eased = steps.threshold - ease(name, ranking.walks[ranking.best_cell(name)])
+    if score < min(eased, SLOW_LEAD):
+        return False
+    if like(steps.scanner, ranking, name, SLOW_IN_TIME):
+        return _slow_structure(steps, ranking, name, score)
+    return first and score >= eased
 
 
-def _slow_structure(ranking: Ranking, name: str, score: float, threshold: float, runs: int) -> bool:
+def _slow_structure(steps: Steps, ranking: Ranking, name: str, score: float) -> bool:
     """Whether a slow change in time is certain, and only a random walk keeps its cause from being so."""
-    if score < SLOW_LEAD or runs > 1 or not like(ranking, name, SLOW_IN_TIME):
+    if score < SLOW_LEAD or steps.scanner.runs > 1:
         return False
     still = [g for g, walks in ranking.walks.items() if not walks]
     logs = np.array([ranking.results[g].log_likelihood + ranking.log_prior[g] for g in still])
     each = np.array([ranking.results[g].evidence.get(name, -np.inf) for g in still])
-    return bool(still) and log_sum(logs + each) - log_sum(logs) > threshold
+    return bool(still) and log_sum(logs + each) - log_sum(logs) > steps.threshold

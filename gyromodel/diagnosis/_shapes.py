@@ -1,14 +1,15 @@
-"""What candidates look like on a campaign: how far apart, what a driver leaves, which sizes could have been seen."""
+"""What candidates look like on a campaign: what a driver leaves, which sizes could have been seen."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from gyromodel.diagnosis._apart import columns_of_best
 from gyromodel.diagnosis._bank import PART_OF
 from gyromodel.diagnosis._drivers import driver_unit, smooth_columns
 from gyromodel.diagnosis._evidence import explained_for
 from gyromodel.diagnosis._forms import form_effect
-from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise, skipped
+from gyromodel.diagnosis._ranking import Ranking, ease, is_driver, is_noise, skipped
 from gyromodel.diagnosis._result import Driver
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import Selection
@@ -16,49 +17,6 @@ from gyromodel.effects import Effect
 from gyromodel.estimate import Estimate
 from gyromodel.model import GyroModel, parameter_unit
 from gyromodel.units import factor, from_internal, internal_unit
-
-
-def _columns(scanner: Scanner, ranking: Ranking, name: str) -> np.ndarray | None:
-    if name not in ranking.results[ranking.best_cell(name)].best:
-        return None
-    form, _, _ = ranking.best_form(name)
-    if name == "outliers":
-        rows = form if isinstance(form, tuple) else (form,)
-        marks = np.zeros((len(scanner.present), len(rows)))
-        marks[list(rows), np.arange(len(rows))] = 1.0
-        return marks
-    if name in ranking.tangents:
-        return ranking.tangents[name].column[:, None]
-    assert isinstance(form, int)
-    effect = form_effect(scanner, name, form)
-    if name in ("bias_step", "bias_periodic"):
-        assert effect is not None
-        return np.asarray(effect.columns(scanner.record.signals))
-    block = scanner.bank.blocks[form]
-    return scanner.bank.columns[:, block.start : block.start + block.width]
-
-
-def separation(scanner: Scanner, ranking: Ranking, a: str, b: str) -> float | None:
-    """Sine of the smallest angle between two candidates' whitened, projected columns, in the noise of the first."""
-    first, second = _columns(scanner, ranking, a), _columns(scanner, ranking, b)
-    if first is None or second is None:
-        return None
-    g = ranking.best_cell(a)
-    w = scanner.cells.whiten(g, np.concatenate([ranking.baseline_columns, first, second], axis=1))
-    p = ranking.baseline_columns.shape[1]
-    base = w[:, :p] / np.maximum(np.linalg.norm(w[:, :p], axis=0), 1e-300)
-    rest = w[:, p:] - base @ np.linalg.lstsq(base, w[:, p:], rcond=1e-10)[0]
-    qa, qb = (_basis(x) for x in (rest[:, : first.shape[1]], rest[:, first.shape[1] :]))
-    if not qa.shape[1] or not qb.shape[1]:
-        return None
-    # The smaller space measured against the larger one.
-    cosine = np.linalg.svd(qa.T @ qb, compute_uv=False)
-    return float(np.sqrt(max(0.0, 1.0 - min(1.0, cosine[: min(qa.shape[1], qb.shape[1])].max()) ** 2)))
-
-
-def _basis(x: np.ndarray) -> np.ndarray:
-    u, s, _ = np.linalg.svd(x / np.maximum(np.linalg.norm(x, axis=0), 1e-300), full_matrices=False)
-    return u[:, s > 1e-5]
 
 
 def remaining(scanner: Scanner, baseline: Estimate, selection: Selection) -> tuple[str | None, float]:
@@ -89,7 +47,7 @@ def remaining(scanner: Scanner, baseline: Estimate, selection: Selection) -> tup
 def driver_shape(scanner: Scanner, selection: Selection, name: str, unit: str) -> Driver:
     """The smooth function behind an unknown discrepancy and its band, at the measured points by its first column."""
     ranking = selection.last
-    columns = _columns(scanner, ranking, name)
+    columns = columns_of_best(scanner, ranking, name)
     assert columns is not None
     record, estimate = scanner.record, selection.estimate
     predicted, jacobian = estimate.model.linearise(record.signals)
@@ -146,7 +104,8 @@ def minimum_detectable(scanner: Scanner, ranking: Ranking, threshold: float, uni
         if is_driver(name) or name == "outliers" or not len(energy):
             continue
         q = widths[name].width if name in widths else (2 if name == "bias_periodic" else 1)
-        needed = np.sqrt(explained_for(threshold + np.log(len(energy)), nu, q)) + 0.84
+        least = threshold - ease(name, ranking.walks[g]) + np.log(len(energy))
+        needed = np.sqrt(explained_for(least, nu, q)) + 0.84
         size = float(needed * sigma / np.sqrt(np.median(energy)))
         if name in ranking.tangents:
             kind = ranking.tangents[name].effect

@@ -95,7 +95,7 @@ class Steps:
 
         A shape between those searched loses a part of what it explains: of much evidence, more than a rival's lead.
         """
-        ranking = rank_where_it_matters(self.scanner, estimate, rows_of(found))
+        ranking = rank_where_it_matters(self._seen(estimate), estimate, rows_of(found))
         (name, score), driver = ranking.best(drivers=False), ranking.best(drivers=True)[1]
         if BETWEEN * score < EXCHANGE or not name or not self.scanner.bank.forms(name):
             return ranking
@@ -130,7 +130,12 @@ class Steps:
 
     def step(self, found: Sequence[Found], estimate: Estimate, ranking: Ranking, name: str) -> Found:
         """A candidate of a ranking beside what was found, as one more step."""
-        return Found(name, *addition(self.scanner, estimate, ranking, name, rows_of(found)), ranking)
+        return Found(name, *addition(self._seen(estimate), estimate, ranking, name, rows_of(found)), ranking)
+
+    def _seen(self, estimate: Estimate) -> Scanner:
+        """The search without the samples at which the output ends: of anything more they tell nothing."""
+        ended = estimate.model.ended(self.scanner.record.signals)[: self.scanner.record.rows]
+        return self.scanner.without(np.flatnonzero(ended), self.scanner.only_cells) if ended.any() else self.scanner
 
     def all_but(self, found: Sequence[Found], i: int) -> tuple[Estimate, Ranking] | None:
         """The fit with everything found except item i, and all candidates beside it; none where that fit fails."""

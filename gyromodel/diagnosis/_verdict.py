@@ -11,13 +11,14 @@ from scipy import stats
 
 from gyromodel.campaign import Campaign
 from gyromodel.declarations import EARLIER, RATE_OF, measured
+from gyromodel.diagnosis._apart import like, separation, twins
 from gyromodel.diagnosis._drivers import smooth_columns
-from gyromodel.diagnosis._exchange import SLOW_IN_TIME, uncontested
-from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise
+from gyromodel.diagnosis._exchange import uncontested
+from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, is_driver, is_noise
 from gyromodel.diagnosis._result import Cause, Confuser, ParameterValue, Verdict
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._search import TIME_MARGIN, Selection, like
-from gyromodel.diagnosis._shapes import remaining, separation
+from gyromodel.diagnosis._search import TIME_MARGIN, Selection
+from gyromodel.diagnosis._shapes import remaining
 from gyromodel.diagnosis._steps import Found, Steps
 from gyromodel.effects import Effect
 from gyromodel.effects.drivers import BiasPeriodic, BiasStep
@@ -52,7 +53,7 @@ class Judgement:
 
 
 def credible(
-    ranking: Ranking, name: str, statistic: float, *, runs: int, beside: frozenset[str] = frozenset()
+    scanner: Scanner, ranking: Ranking, name: str, statistic: float, *, beside: frozenset[str] = frozenset()
 ) -> dict[str, float]:
     """The smallest set of names with 95 % of the posterior, for the cause found as `name`; forms of a family merged.
 
@@ -60,14 +61,15 @@ def credible(
     """
     # A step at the edge of the record is a gross error as well.
     apart = beside | (set() if name in ("outliers", "bias_step") else {"outliers"})
-    own = {k: v for k, v in ranking.statistic.items() if not is_driver(k) and (k == name or k not in apart)}
-    hidden_by_walk = like(ranking, name, NO_EDGE) and ranking.walks[ranking.best_cell(name)]
-    too_close = statistic < TIME_MARGIN and ranking.slow_noise and like(ranking, name, SLOW_IN_TIME)
+    # What explains the data worse than nothing at all is no explanation of what was found.
+    own = {k: v for k, v in ranking.statistic.items() if k == name or not (v < 0.0 or is_driver(k) or k in apart)}
+    hidden_by_walk = like(scanner, ranking, name, NO_EDGE) and ranking.walks[ranking.best_cell(name)]
+    too_close = statistic < TIME_MARGIN and ranking.slow_noise and like(scanner, ranking, name, SLOW_IN_TIME)
     if name not in ("outliers", "bias_step", "bias_periodic") and not is_noise(name):
         # Only the number of forms and coefficients sets them apart, which is no evidence.
-        own |= {k: max(own[k], own[name]) for k in ranking.twins(name) & own.keys()}
+        own |= {k: max(own.get(k, 0.0), own[name]) for k in twins(scanner, ranking, name) - apart}
     # A drift comes back with the next run, and a step does not.
-    if (runs < 2 or name == "bias_step") and (hidden_by_walk or too_close):
+    if (scanner.runs < 2 or name == "bias_step") and (hidden_by_walk or too_close):
         own["noise_random_walk"] = max(0.0, statistic - 1.0)
     top = max(own.values())
     weight = {k: float(np.exp(v - top)) for k, v in own.items()}
@@ -113,7 +115,6 @@ def judge(
     """The verdict on a finished search; `searched`: the record's campaigns, and whether they are as given."""
     scanner, baseline, record = steps.scanner, steps.baseline, steps.scanner.record
     found = list(selection.found)
-    runs = scanner.runs
     causes, sets, findings = [], [], []
     given_up = sorted(row for step in found for row in step.points)
     if given_up and not scanner.by_points:
@@ -141,7 +142,7 @@ def judge(
         statistic = ranking.statistic[name]
         beside = frozenset(f.name for f in found if f is not step)
         # What was not added may stand in the place of this.
-        members = credible(ranking, name, statistic, runs=runs, beside=beside - {selection.remains})
+        members = credible(scanner, ranking, name, statistic, beside=beside - {selection.remains})
         if name == "outliers":
             if scanner.by_points and _unrepeated(record, step.points):
                 members = {k: 0.5 * share for k, share in members.items()} | {"scale_spline": 0.5}

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from gyromodel._checks import accelerations, thermometers
 
 Signals = Mapping[str, Float[Array, " sample"]]
-Site = Literal["gain", "scale", "rate", "angle"]
+Site = Literal["gain", "scale", "rate", "output", "angle"]
 Domain = Literal["gyro", "platform"]
 # In `needs`: any thermometer besides `temperature`, and any column of specific force. Columns of which one is enough
 # are joined by " or ".
@@ -62,8 +62,9 @@ CATALOGUE: dict[str, type[Effect]] = {}
 class Effect(eqx.Module):
     """One additive term of the gyro model.
 
-    `site` says where it acts in output = gain · (rate + Σ rate terms) · (1 + Σ scale terms), and `domain` whose output
-    it is: that of a gyro, or the angle of a platform's base less that of its table, a sum of angle terms alone. Fields
+    `site` says where it acts in output = gain · (u + output terms), u = (rate + Σ rate terms) · (1 + Σ scale terms): to
+    an output term, u is the signal "rate". `domain` says whose output it is: that of a gyro, or the angle of a
+    platform's base less that of its table, a sum of angle terms alone. Fields
     declared with `parameter` are its parameters. `columns` returns one column per linear coefficient, in field order,
     and may depend on the nonlinear ones; the contribution is columns @ coefficients, so zero coefficients are exactly
     the model without it.
@@ -181,7 +182,7 @@ class Effect(eqx.Module):
         return changed
 
     def contribution(self, signals: Signals) -> Float[Array, " sample"]:
-        """The effect's term, in rad/s for site "rate", rad for "angle", dimensionless for "scale"."""
+        """The effect's term, in rad/s for sites "rate" and "output", rad for "angle", dimensionless for "scale"."""
         return self.columns(signals) @ self.linear()
 
     def shape_derivatives(self, signals: Signals) -> Float[Array, "sample shape"]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Self
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -15,7 +17,7 @@ LOWEST, HIGHEST, LIMITS, FEWEST_BEYOND = 0.2, 0.99, 24, 2
 # Series over the ramp: how many harmonics, and periods searched as parts of its span. A ramp's ends need not meet:
 # twice the span leaves them free.
 SERIES = (
-    (1, 1.0 / np.arange(0.5, 8.5, 0.5)),
+    (1, 1.0 / np.arange(0.5, 32.5, 0.5)),
     (2, 1.0 / np.array([0.5, 0.75, 1.0, 2.0, 4.0])),
     (4, 1.0 / np.array([0.5, 0.75, 1.0, 2.0])),
     (8, 1.0 / np.array([0.5, 0.75, 1.0])),
@@ -23,13 +25,13 @@ SERIES = (
 
 
 class Saturation(Effect):
-    """E += max(−ω_max, min(ω, ω_max)) − ω: the output ends at the limits of its range.
+    """output = S₀ max(−ω_max, min(u, ω_max)), u = (I + E + D)(1 + ε): the output ends at the limits of its range.
 
     The search lets a share of the effect vary to have a linear coefficient; the fit holds it at one.
     """
 
     id = "saturation"
-    site = "rate"
+    site = "output"
     needs = ("rate",)
     cause = "The converter, the torquer or the loop has no more range."
     test = "Leave out the largest rates: a nonlinearity bends those below as well, saturation does not."
@@ -45,7 +47,7 @@ class Saturation(Effect):
             raise ValueError("a range ends above zero")
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
-        """The rate cut at its limits, less the rate."""
+        """What is told, cut at the limits, less what is told."""
         return stack(jnp.clip(signals["rate"], -self.limit, self.limit) - signals["rate"])
 
     def settled(self) -> Self:
@@ -64,6 +66,7 @@ class BiasReadoutCode(Effect):
     """D += Σ A_k cos(2πkc/P) + B_k sin(2πkc/P), c the code of the closed loop's ramp: an error of the ramp's codes.
 
     A period P of twice the ramp's span serves for errors that do not meet at its ends, such as those of its flyback.
+    k runs over `harmonics`, or from 1 on.
     """
 
     id = "bias_readout_code"
@@ -77,16 +80,24 @@ class BiasReadoutCode(Effect):
     cosine: Float[Array, " harmonic"] = parameter("deg/h", 1.0, "in-phase amplitude of each harmonic", default=(0.0,))
     sine: Float[Array, " harmonic"] = parameter("deg/h", 1.0, "quadrature amplitude of each harmonic", default=(0.0,))
     period: Float[Array, ""] = parameter("1", 3e4, "in the ramp's counts, V or rad", linear=False, default=65536.0)
+    harmonics: tuple[int, ...] = eqx.field(static=True, default=())
 
     def __check_init__(self) -> None:
+        if self.harmonics and (len(self.harmonics) != self.cosine.size or min(self.harmonics) < 1):
+            raise ValueError("harmonics are numbered from 1 on, one for each cosine")
         if self.cosine.shape != self.sine.shape or self.period <= 0:
             raise ValueError("every harmonic needs a cosine and a sine, and the period is above zero")
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """The cosines, then the sines."""
-        harmonic = 1.0 + jnp.arange(self.cosine.shape[0])
+        harmonic = jnp.asarray(self.harmonics or range(1, 1 + self.cosine.shape[0]), float)
         phase = 2.0 * jnp.pi * signals["feedback_ramp"][:, None] * harmonic / self.period
         return jnp.concatenate([jnp.cos(phase), jnp.sin(phase)], axis=1)
+
+    def with_harmonics(self, numbers: Sequence[int]) -> Self:
+        """The code's error in some harmonics, at zero."""
+        none = jnp.zeros(len(numbers))
+        return type(self)(cosine=none, sine=none, period=self.period, harmonics=tuple(numbers))
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:

@@ -19,6 +19,8 @@ from gyromodel.model import GyroModel
 from gyromodel.numerics.state_space import Filter, at_rest, whiten_on
 
 BLOCK = 512
+# Sites whose rows depend on what all other effects add up to.
+LATER = ("gain", "output")
 
 # Of one effect: a row for each linear coefficient, and one for each nonlinear parameter; None where there is none free.
 Rows = tuple[Float[Array, "*block coefficient sample"], Float[Array, "*block shape sample"] | None]
@@ -65,7 +67,7 @@ def gram_and_roughness(
     steady = {
         i: rows_of(effect, ())
         for i, effect in enumerate(model.effects)
-        if effect.site != "gain" and not _shaped(effect, free.get(i, ()))
+        if effect.site not in LATER and not _shaped(effect, free.get(i, ()))
     }
 
     def at(x: Vector) -> tuple[GyroModel, Known]:
@@ -74,7 +76,7 @@ def gram_and_roughness(
         In a loop of their own: the compiler would compute an exponential again for each row that contains it.
         """
         now = model.with_vector(x)
-        others = {i: rows_of(e, free[i]) for i, e in enumerate(now.effects) if e.site != "gain" and i not in steady}
+        others = {i: rows_of(e, free[i]) for i, e in enumerate(now.effects) if e.site not in LATER and i not in steady}
         return now, steady | others
 
     def gram(x: Vector) -> Float[Array, "column column"]:
@@ -170,24 +172,30 @@ def _stacked(
     rate = signals.get("rate", jnp.zeros_like(signals["time"]))
     scale = jnp.ones_like(rate)
     for i, effect in enumerate(model.effects):
-        if effect.site == "gain":
+        if effect.site in LATER:
             continue
         term = effect.linear() @ known[i][0]
         rate, scale = (rate + term, scale) if effect.site == "rate" else (rate, scale + term)
-    by_rate, by_scale = (jnp.where(weight > 0, weight * model.gain() * v, 0.0) for v in (scale, rate))
-    prediction = by_scale * scale
+    by = {"rate": scale, "scale": rate}
+    told = rate * scale
+    ends = {i: e for i, e in enumerate(model.effects) if e.site == "output"}
+    if ends:
+        by = {site: v * model.passed(told, signals) for site, v in by.items()} | {"output": jnp.ones_like(told)}
+        known = {**known, **{i: _rows(e, {**signals, "rate": told}, free.get(i, ())) for i, e in ends.items()}}
+        told = model.told(told, signals)
+    by = {site: jnp.where(weight > 0, weight * model.gain() * v, 0.0) for site, v in by.items()}
+    prediction = jnp.where(weight > 0, weight * model.gain() * told, 0.0)
     stacked = []
     for i, names in free.items():
         effect = model.effects[i]
         if effect.site == "gain":
             stacked.append((prediction / effect.value)[None])  # type: ignore[attr-defined]
             continue
-        by = by_rate if effect.site == "rate" else by_scale
         for name in names:
             linear = effect.declared()[name].linear
             alike = [k for k, d in effect.declared().items() if d.linear == linear and (linear or k in names)]
             start = sum(np.size(getattr(effect, k)) for k in alike[: alike.index(name)])
             part = known[i][0 if linear else 1]
-            stacked.append(by * part[start : start + np.size(getattr(effect, name))])  # type: ignore[index]
+            stacked.append(by[effect.site] * part[start : start + np.size(getattr(effect, name))])  # type: ignore[index]
     measured = jnp.where(weight > 0, weight * signals["output"], 0.0)
     return jnp.concatenate([*stacked, (prediction - measured)[None]])

@@ -1,0 +1,91 @@
+"""How far apart candidates lie on a campaign, and which of them are the same there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gyromodel.diagnosis._forms import form_effect
+from gyromodel.diagnosis._ranking import Ranking, is_driver
+from gyromodel.diagnosis._scan import Scanner
+from gyromodel.model import effect_class
+
+# Candidates whose sums of squares differ by less than this part of the noise variance have the same signal …
+ALIKE = 0.2
+# … where their columns lie no farther apart than this sine: among many lines one explains as much by chance.
+HELD = 0.5
+
+
+def twins(scanner: Scanner, ranking: Ranking, name: str) -> set[str]:
+    """Effects whose signals hold a candidate's, with at most one coefficient more.
+
+    No size of it would tell them apart on this campaign. A form that contains another which was searched is no twin: it
+    follows whatever that one leaves. Nor is a step one of a bias, which it becomes at an end of the record; fits tell
+    what the shapes searched cannot.
+    """
+    if name in ranking.fitted:
+        return set()
+    result = ranking.results[ranking.best_cell(name)]
+    _, explained, q = result.best[name]
+    least = explained - ALIKE * (result.rss - explained) / ranking.samples
+    alike = {
+        k
+        for k, (_, t, width) in result.best.items()
+        if k not in (name, "outliers", "bias_step" if name == "bias" else "")
+        and k in ranking.statistic and not is_driver(k)
+        and width <= q + 1 and t >= least
+        and not result.best.keys() & set(effect_class(k).supersedes) - {k}
+    }  # fmt: skip
+    return {k for k in alike if (apart := separation(scanner, ranking, name, k)) is not None and apart <= HELD}
+
+
+def like(scanner: Scanner, ranking: Ranking, name: str, others: Sequence[str]) -> bool:
+    """Whether a candidate is one of some names, or has the same signal as one of them."""
+    if name in others or name == "outliers" or name not in ranking.results[ranking.best_cell(name)].best:
+        return name in others
+    return not twins(scanner, ranking, name).isdisjoint(others)
+
+
+def columns_of_best(scanner: Scanner, ranking: Ranking, name: str) -> np.ndarray | None:
+    """Columns of a candidate's best form; none where it was not searched."""
+    if name not in ranking.results[ranking.best_cell(name)].best:
+        return None
+    form, _, _ = ranking.best_form(name)
+    if name == "outliers":
+        rows = form if isinstance(form, tuple) else (form,)
+        marks = np.zeros((len(scanner.present), len(rows)))
+        marks[list(rows), np.arange(len(rows))] = 1.0
+        return marks
+    if name in ranking.tangents:
+        return ranking.tangents[name].column[:, None]
+    assert isinstance(form, int)
+    effect = form_effect(scanner, name, form)
+    if name in ("bias_step", "bias_periodic"):
+        assert effect is not None
+        return np.asarray(effect.columns(scanner.record.signals))
+    block = scanner.bank.blocks[form]
+    return scanner.bank.columns[:, block.start : block.start + block.width]
+
+
+def separation(scanner: Scanner, ranking: Ranking, a: str, b: str) -> float | None:
+    """Sine of the smallest angle between two candidates' whitened, projected columns, in the noise of the first."""
+    first, second = columns_of_best(scanner, ranking, a), columns_of_best(scanner, ranking, b)
+    if first is None or second is None:
+        return None
+    g = ranking.best_cell(a)
+    w = scanner.cells.whiten(g, np.concatenate([ranking.baseline_columns, first, second], axis=1))
+    p = ranking.baseline_columns.shape[1]
+    base = w[:, :p] / np.maximum(np.linalg.norm(w[:, :p], axis=0), 1e-300)
+    rest = w[:, p:] - base @ np.linalg.lstsq(base, w[:, p:], rcond=1e-10)[0]
+    qa, qb = (_basis(x) for x in (rest[:, : first.shape[1]], rest[:, first.shape[1] :]))
+    if not qa.shape[1] or not qb.shape[1]:
+        return None
+    # The smaller space measured against the larger one.
+    cosine = np.linalg.svd(qa.T @ qb, compute_uv=False)
+    return float(np.sqrt(max(0.0, 1.0 - min(1.0, cosine[: min(qa.shape[1], qb.shape[1])].max()) ** 2)))
+
+
+def _basis(x: np.ndarray) -> np.ndarray:
+    u, s, _ = np.linalg.svd(x / np.maximum(np.linalg.norm(x, axis=0), 1e-300), full_matrices=False)
+    return u[:, s > 1e-5]
