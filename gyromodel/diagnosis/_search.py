@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from gyromodel.declarations import measured
 from gyromodel.diagnosis._apart import like
 from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._evidence import log_evidence_ratio, log_sum
@@ -97,7 +98,7 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
     if score > threshold and _lead(steps, str(driver), path, ranking) > EXCHANGE:
         # One smooth driver explains more than all the names together; names of its own columns may have had to stand
         # back behind one that follows several of them.
-        own, first = set(smooth_columns(str(driver))), path[0].effect
+        own, first = {measured(column)[0] for column in smooth_columns(str(driver))}, path[0].effect
         if not avoid and first is not None and not own >= set(first.columns_needed):
             other = search(steps, progress, path[0].name)
             if other.found:
