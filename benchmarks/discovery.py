@@ -159,6 +159,13 @@ def _leak(records: list[study.Record], size: float) -> str:
                   measured, len(records), bool(fair))  # fmt: skip
 
 
+def _bound(records: list[study.Record]) -> str:
+    """Row 5 of an oracle that knows noise and size, and needs as much evidence and as large a share as the engine."""
+    named, count = levels.oracle_names(records)
+    measure = "what bounds it: named by the oracle as firmly, 1×"
+    return f"| 5 | {measure} | – | – | {100 * named / max(count, 1):.1f} % | {count} | – |"
+
+
 def _mutants(
     run: Run, nulls: list[study.Case], effects: list[study.Case], more: list[study.Case]
 ) -> tuple[list[str], list[str], list[study.Record]]:
@@ -423,6 +430,7 @@ def _write(args: argparse.Namespace, argv: Sequence[str], found: Study) -> None:
         _check("7", "mean size of the 95 % set, isolable, 3×", f"≤ {levels.SET_SIZE}", three, at_three, small),
         found.seconds,
         *(_leak(sized[s], s) for s in (1.0, 3.0)),
+        _bound(sized[1.0]),
         *control_checks,
         *found.mutants[1],
     ]

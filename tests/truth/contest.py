@@ -20,6 +20,9 @@ from .mde import Oracle, baseline
 from .memory import friction
 from .motion import BASIS, SMALL
 
+# Share of the posterior and evidence (nats) of a name that is firm.
+FIRM, NEEDED = 0.95, 4.0
+
 Array = np.ndarray
 Library = dict[str, Array]
 
@@ -88,15 +91,21 @@ def energies(unit: Library, residual: Array) -> dict[str, Array]:
     return {name: np.sum(np.tensordot(residual, u, 1) ** 2, axis=-1) for name, u in unit.items()}
 
 
-def oracle_first(unit: Library, residual: Array, size: float) -> str:
-    """Most probable name when noise and size (lambda) are known; direction and shape uniform on their grids."""
+def oracle_answer(unit: Library, residual: Array, size: float) -> tuple[str, bool]:
+    """Most probable name when noise and size (lambda) are known; direction and shape uniform on their grids.
+
+    And whether it is firm: 95 % of the posterior over names, with the evidence against nothing hidden that an addition
+    needs.
+    """
     score = {}
     for name, energy in energies(unit, residual).items():
         order, x = unit[name].shape[2] / 2 - 1, size * np.sqrt(energy)
         score[name] = float(
             logsumexp(gammaln(order + 1) + order * np.log(2 / x) + np.log(ive(order, x)) + x, b=1 / len(x))
         )
-    return max(score, key=score.__getitem__)
+    first = max(score, key=score.__getitem__)
+    share = np.exp(score[first] - logsumexp(list(score.values())))
+    return first, bool(share >= FIRM and score[first] - size**2 / 2 >= NEEDED)
 
 
 def separation_needed(unit: Library, truth: str, signal: Array) -> dict[str, float]:

@@ -115,6 +115,12 @@ def oracle_right(record: Record) -> bool:
     return record.oracle_first in allowed(str(record.case.effect), record.case.design)[0]
 
 
+def oracle_names(records: list[Record]) -> tuple[int, int]:
+    """What bounds row 5: campaigns where the oracle's name is right and firm, and of how many."""
+    alone = _alone(records)
+    return sum(r.oracle_firm and oracle_right(r) for r in alone), len(alone)
+
+
 def surpassed(records: list[Record]) -> tuple[int, int]:
     """Campaigns where only the engine's first name was right, and those where only the oracle's was."""
     pairs = [(r.score.first_right, oracle_right(r)) for r in _contested(records) if r.score]

@@ -61,7 +61,8 @@ class Record:
     """A case, what the engine answered and how that was judged.
 
     `size` is the norm lambda of the hidden signal; `isolable` whether every rival separates from it at 3 x MDE;
-    `oracle_first` what the oracle names; `controls` what the control methods answer.
+    `oracle_first` what the oracle names, and `oracle_firm` whether it is sure; `controls` what the control methods
+    answer.
     """
 
     case: Case
@@ -71,6 +72,7 @@ class Record:
     size: float
     isolable: bool
     oracle_first: str
+    oracle_firm: bool
     controls: dict[str, contest.Control]
 
 
@@ -152,7 +154,7 @@ def run_case(
     """Simulate, diagnose and judge one case, also by some controls; `options` are those of `run_engine`."""
     built = build(case, noise_of)
     truth, design = built.truth, built.design
-    size, isolable, first, others = 0.0, False, "", {}
+    size, isolable, first, firm, others = 0.0, False, "", False, {}
     if controls or known(case.effect):
         signals = contest.library(design, case.effect)
         data = built.columns["output"] * np.pi / 180 - design.true["rate"]
@@ -160,7 +162,7 @@ def run_case(
         knower = oracle(design, built.noise, truth.baseline)
         unit = contest.reduced(knower, signals)
         size = knower.norm(truth.error)
-        first = contest.oracle_first(unit, knower.reduce(data[:, None])[:, 0], size)
+        first, firm = contest.oracle_answer(unit, knower.reduce(data[:, None])[:, 0], size)
         isolable = _isolable(case, truth, knower, signals)
     if controls:
         plain = oracle(design, Noise("white", np.sqrt(design.step)), truth.baseline)  # unit variance: least squares
@@ -176,7 +178,7 @@ def run_case(
         others = {name: methods[name]() for name in controls}
     answer = run_engine(built, **options) if engine else None
     score = judge(truth, design.name, answer, isolable or not known(case.effect)) if answer else None
-    return Record(case, truth, answer, score, size, isolable, first, others)
+    return Record(case, truth, answer, score, size, isolable, first, firm, others)
 
 
 def _isolable(case: Case, truth: Truth, knower: Oracle, signals: contest.Library) -> bool:
