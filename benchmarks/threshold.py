@@ -74,7 +74,8 @@ def main(argv: list[str] | None = None) -> None:
     total = draws * len(NOISES)
     lines = [
         "S is the largest ln evidence ratio of all candidates, with the nat that a name needs less where the noise "
-        "beside it has no random walk. Campaigns of noise alone on the design of the fiber-optic demo, through the search over the noise cells that carry weight.",
+        "beside it has no random walk. Campaigns of noise alone on the design of the fiber-optic demo, "
+        "through the search over the noise cells that carry weight.",
         "",
         *table(head, rows),
         "",
