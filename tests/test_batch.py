@@ -307,6 +307,53 @@ def test_a_worker_that_dies_loses_nothing(tmp_path: Path):
     assert len({(row["campaign"], row["parameter"]) for row in rows}) == len(rows) == 24 * 5
 
 
+@pytest.mark.long
+def test_a_scheduler_that_dies_loses_nothing(tmp_path: Path):
+    """One sentence, no row of what it had not finished, and the next run ends with the rows of one that was left alone."""
+    archive(tmp_path, 40)
+    assert batch(tmp_path, results="whole.parquet")[0] == 0
+    dask = [sys.executable, "-m", "distributed.cli"]
+    where, quiet = tmp_path / "scheduler.json", {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(where)]
+    scheduler = subprocess.Popen([*dask[:2], f"{dask[2]}.dask_scheduler", *options], **quiet)
+    while not where.exists():
+        time.sleep(0.02)
+    address = json.loads(where.read_text())["address"]
+    options = ["--nthreads", "1", "--no-nanny", "--no-dashboard"]
+    worker = subprocess.Popen([*dask[:2], f"{dask[2]}.dask_worker", address, *options], **quiet, cwd=tmp_path)
+    command = [sys.executable, "-m", "gyromodel", "batch", str(tmp_path / "archive"), "--scheduler", address]
+    options = ["--model", str(tmp_path / "model.yaml"), "-o", str(tmp_path / "results.parquet")]
+    process = subprocess.Popen([*command, *options], stderr=subprocess.PIPE, text=True)
+    parts = tmp_path / ".results.parquet.parts"
+    try:
+        while process.poll() is None and not list(parts.glob("*.parquet")):
+            time.sleep(0.02)
+        scheduler.kill()
+        said = process.communicate(timeout=60)[1]
+    finally:
+        for each in (process, worker, scheduler):
+            each.kill()
+            each.wait()
+    assert process.returncode == 1
+    assert said == f"gyromodel: {address}: the Dask scheduler was lost; the same command goes on from here\n"
+    rows = [row for part in parts.glob("*.parquet") for row in parquet.read_table(part).to_pylist()]
+    finished = {row["campaign"] for row in rows}
+    assert {row["status"] for row in rows} == {"fitted"}
+    status, result = batch(tmp_path)
+    assert (status, result["examined"]) == (0, 40 - len(finished))
+    assert parquet.read_table(tmp_path / "results.parquet").equals(parquet.read_table(tmp_path / "whole.parquet"))
+
+
+def test_parts_without_a_row_that_counts_merge(tmp_path: Path):
+    """What failed for the machine alone is in a part of its own, and done again later."""
+    head = {name: "m" for name in ("campaign", "status", "file_state")}
+    with storage.Results(tmp_path / "results.parquet", {"model": "m"}) as kept:
+        for status in ("failed", "fitted"):
+            kept.add([head | {"status": status}])
+            kept.flush()
+        assert kept.merge([Entry("m", "/m")])["status"].to_pylist() == ["fitted"]
+
+
 def test_archives_of_every_kind(tmp_path: Path):
     folder = tmp_path / "a"
     (folder / "x" / ".hidden").mkdir(parents=True)

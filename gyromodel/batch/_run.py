@@ -144,10 +144,12 @@ def _here(lots: Sequence[Lot]) -> Iterator[tuple[Lot, list[Row]]]:
 def _on_cluster(lots: Sequence[Lot], workers: int, scheduler: str | None) -> Iterator[tuple[Lot, list[Row]]]:
     """Rows of each lot as it ends, whatever becomes of single workers."""
     from dask.config import set as configured
-    from distributed import Client, LocalCluster, as_completed
+    from distributed import CancelledError, Client, LocalCluster, as_completed
+    from distributed.client import ClosedClientError
 
     # Its warnings, and its tracebacks while it ends, are of no use to who waits for a table.
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     with configured({"distributed.scheduler.allowed-failures": LOST}), ExitStack() as open_ones:
         if scheduler is None:
             quiet = {"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
@@ -166,18 +168,26 @@ def _on_cluster(lots: Sequence[Lot], workers: int, scheduler: str | None) -> Ite
             return list(new)
 
         ahead = WAITING * max(workers, len(client.scheduler_info()["workers"]))
-        running = as_completed(submitted(ahead))
-        for future in running:
-            lot = of.pop(future.key)
-            if future.status == "finished":
-                yield lot, future.result()
-            elif len(lot.entries) > 1:
-                # One of them may be what no worker survives.
-                both = zip(lot.entries, lot.states, strict=True)
-                waiting += [lot._replace(entries=(entry,), states=(state,)) for entry, state in both]
-            else:
-                yield lot, [failed(lot.heads()[0], future.exception())]
-            running.update(submitted(1))
+        try:
+            running = as_completed(submitted(ahead))
+            for future in running:
+                # Without its scheduler a client cancels what it waits for, and would wait for ever for anything new.
+                if future.status == "cancelled" or client.status != "running":
+                    raise CancelledError
+                lot = of.pop(future.key)
+                if future.status == "finished":
+                    yield lot, future.result()
+                elif len(lot.entries) > 1:
+                    # One of them may be what no worker survives.
+                    both = zip(lot.entries, lot.states, strict=True)
+                    waiting += [lot._replace(entries=(entry,), states=(state,)) for entry, state in both]
+                else:
+                    yield lot, [failed(lot.heads()[0], future.exception())]
+                running.update(submitted(1))
+        except (CancelledError, ClosedClientError, OSError):
+            raise CampaignError(
+                f"{scheduler}: the Dask scheduler was lost; the same command goes on from here"
+            ) from None
 
 
 @contextmanager
