@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import glob
 import os
@@ -16,8 +17,8 @@ from pathlib import Path
 def sibling(target: Path) -> Iterator[Path]:
     """A hidden name beside a target, for what is to take its place; what still has it at the end is removed.
 
-    What killed runs have left there is removed first: a run that writes holds a lock on the folder, which the system
-    takes back however the run ends.
+    What killed runs have left there is removed first, and a folder that they had put aside put back where nothing stands
+    in its place: a run that writes holds a lock on the folder, which the system takes back however the run ends.
     """
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
     with ExitStack() as held:
@@ -28,11 +29,39 @@ def sibling(target: Path) -> Iterator[Path]:
             held.callback(os.close, folder)
             with suppress(BlockingIOError):
                 fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                for left in target.parent.glob(f".{glob.escape(target.name)}.{'?' * 8}.old"):
+                    _remove(left) if target.exists() else os.replace(left, target)
                 for left in target.parent.glob(f".{glob.escape(target.name)}.{'?' * 8}.tmp"):
                     _remove(left)
             fcntl.flock(folder, fcntl.LOCK_SH | fcntl.LOCK_NB)
         held.callback(_remove, temporary)
         yield temporary
+
+
+def replace_folder(temporary: Path, target: Path) -> None:
+    """Put one folder in the place of another, which then has its name.
+
+    In one step, so that there is always one for who reads; in three where the system or a network drive has no such step.
+    """
+    try:
+        _exchange(temporary, target)
+    except (AttributeError, OSError):
+        aside = temporary.with_suffix(".old")
+        os.replace(target, aside)
+        try:
+            os.replace(temporary, target)
+        except OSError:
+            os.replace(aside, target)
+            raise
+        os.replace(aside, temporary)
+
+
+def _exchange(one: Path, other: Path) -> None:
+    """Linux's renameat2 with RENAME_EXCHANGE; absolute paths."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.renameat2(0, os.fsencode(one), 0, os.fsencode(other), 2):
+        code = ctypes.get_errno()
+        raise OSError(code, os.strerror(code), str(other))
 
 
 def _remove(path: Path) -> None:

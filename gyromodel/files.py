@@ -10,7 +10,6 @@ import gzip
 import math
 import mmap
 import os
-import shutil
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -19,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from gyromodel._atomic import sibling
+from gyromodel._atomic import replace_folder, sibling
 from gyromodel._checks import CampaignError, check_unit, shown
 from gyromodel._csv import (
     Contents,
@@ -113,15 +112,7 @@ def replacing(target: Path) -> Iterator[Path]:
         with sibling(path) as temporary:
             yield temporary
             if path.is_dir():
-                # A folder cannot be replaced in one step: the old one steps aside first.
-                aside = temporary.with_suffix(".old")
-                os.replace(path, aside)
-                try:
-                    os.replace(temporary, path)
-                except OSError:
-                    os.replace(aside, path)
-                    raise
-                shutil.rmtree(aside)
+                replace_folder(temporary, path)
             else:
                 os.replace(temporary, path)
     except OSError as error:

@@ -309,7 +309,7 @@ def test_a_worker_that_dies_loses_nothing(tmp_path: Path):
 
 @pytest.mark.long
 def test_a_scheduler_that_dies_loses_nothing(tmp_path: Path):
-    """One sentence, no row of what it had not finished, and the next run ends with the rows of one that was left alone."""
+    """One sentence, no row of what it had not finished, and the next run ends with the rows of one left alone."""
     archive(tmp_path, 40)
     assert batch(tmp_path, results="whole.parquet")[0] == 0
     dask = [sys.executable, "-m", "distributed.cli"]
@@ -346,7 +346,7 @@ def test_a_scheduler_that_dies_loses_nothing(tmp_path: Path):
 
 def test_parts_without_a_row_that_counts_merge(tmp_path: Path):
     """What failed for the machine alone is in a part of its own, and done again later."""
-    head = {name: "m" for name in ("campaign", "status", "file_state")}
+    head = dict.fromkeys(("campaign", "status", "file_state"), "m")
     with storage.Results(tmp_path / "results.parquet", {"model": "m"}) as kept:
         for status in ("failed", "fitted"):
             kept.add([head | {"status": status}])

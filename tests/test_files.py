@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -132,6 +133,49 @@ def test_what_a_killed_write_left_goes_with_the_next(tmp_path: Path, suffix: str
         (tmp_path / "c.csv").touch()
     write_campaign(small_campaign(), path)
     assert {*tmp_path.iterdir()} == {path, tmp_path / "c.csv", *others}
+
+
+KILLED = """
+import os, shutil, sys
+from gyromodel import _atomic, files
+from tests.helpers import small_campaign
+def killing(whole, left=[int(sys.argv[2])]):
+    def step(*arguments, **options):
+        done = whole(*arguments, **options)
+        left[0] -= 1
+        if not left[0]:
+            os.kill(os.getpid(), 9)
+        return done
+    return step
+os.replace, _atomic._exchange, shutil.rmtree = map(killing, (os.replace, _atomic._exchange, shutil.rmtree))
+if len(sys.argv) > 3:
+    def _exchange(*_):
+        raise OSError(22, "Invalid argument")
+    _atomic._exchange = _exchange
+files.write_campaign(small_campaign(serial="008"), sys.argv[1])
+"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("swaps", [True, False])
+def test_a_folder_killed_at_any_step_of_its_replacement_is_there(tmp_path: Path, swaps: bool):
+    """Without a swap in one step, it is from the next write on, even of one that fails."""
+    path, steps = tmp_path / "a.zarr", 0
+    while True:
+        write_campaign(small_campaign(), path)
+        steps += 1
+        command = [sys.executable, "-c", KILLED, str(path), str(steps), *([] if swaps else ["x"])]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode == 0:
+            break
+        assert done.returncode == -9, done.stderr
+        if not swaps:
+            with suppress(ZeroDivisionError), replacing(path):
+                1 / 0
+        assert read_campaign(path).metadata["serial"] in ("007", "008")
+        write_campaign(small_campaign(), path)
+        assert os.listdir(tmp_path) == ["a.zarr"]
+    assert steps > (2 if swaps else 4)
 
 
 def test_where_nothing_can_be_written(tmp_path: Path):
