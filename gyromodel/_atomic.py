@@ -17,8 +17,8 @@ from pathlib import Path
 def sibling(target: Path) -> Iterator[Path]:
     """A hidden name beside a target, for what is to take its place; what still has it at the end is removed.
 
-    What killed runs have left there is removed first, and a folder that they had put aside put back where nothing stands
-    in its place: a run that writes holds a lock on the folder, which the system takes back however the run ends.
+    What killed runs have left there is removed first, and a folder that they put aside is put back where nothing
+    stands in its place: a run that writes holds a lock on the folder, which the system takes back however the run ends.
     """
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
     with ExitStack() as held:
@@ -41,7 +41,7 @@ def sibling(target: Path) -> Iterator[Path]:
 def replace_folder(temporary: Path, target: Path) -> None:
     """Put one folder in the place of another, which then has its name.
 
-    In one step, so that there is always one for who reads; in three where the system or a network drive has no such step.
+    In one step, so that who reads always finds one; in three where the system or a network drive lacks that step.
     """
     try:
         _exchange(temporary, target)

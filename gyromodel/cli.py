@@ -12,10 +12,10 @@ from typing import Annotated, Literal
 import typer
 
 import gyromodel
+from gyromodel.__main__ import INTERRUPTED
 from gyromodel._atomic import write_text
 from gyromodel._compiling import keep_compiled, switch_compiler
 from gyromodel._console import (
-    INTERRUPTED,
     interrupts_kept,
     json_text,
     prepare_folder,
@@ -45,7 +45,11 @@ Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of the random dra
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line; ends with the exit status of the contract: 0 done, 1 cannot answer, 2 wrong usage."""
+    """Run the command line; ends with the exit status of the contract: 0 done, 1 cannot answer, 2 wrong usage.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C, which `__main__` tells of.
+    """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")  # an equation's ε must not stop a terminal that lacks it
@@ -57,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             typer.main.get_command(app)(args=arguments, prog_name="gyromodel")
     except SystemExit as end:
         if end.code == INTERRUPTED:
-            print("gyromodel: interrupted; no file is half written, and batch goes on where it was", file=sys.stderr)
+            raise KeyboardInterrupt from None
         raise
     except Exception as error:
         if os.environ.get("GYROMODEL_DEBUG") == "1":

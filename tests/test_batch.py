@@ -243,7 +243,7 @@ def test_a_full_disk_leaves_what_is_there(tmp_path: Path, monkeypatch: pytest.Mo
 
 LOST = """
 import gc, signal
-from gyromodel import _archive_files, cli
+from gyromodel import __main__, _archive_files
 def interrupt(*_):
     gc.callbacks.remove(interrupt)
     signal.raise_signal(signal.SIGINT)
@@ -251,7 +251,7 @@ def run(*arguments, whole=_archive_files.run_batch, **options):
     gc.callbacks.append(interrupt)
     return whole(*arguments, **options)
 _archive_files.run_batch = run
-cli.main()
+__main__.main()
 """
 
 
