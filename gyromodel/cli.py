@@ -234,11 +234,13 @@ def sensitivity(
     ] = None,
     budget: Annotated[str | None, typer.Option(metavar="TIME", help='Time for that plan, such as "4 h".')] = None,
     criterion: Annotated[
-        Literal["parameters", "outcome", "discrimination"],
+        Literal["parameters", "outcome", "discrimination"] | None,
         typer.Option(
-            help="What that plan is best for: parameters, the first outcome, or telling --rival effects apart."
+            help="What that plan is best for: telling --rival effects apart where some are given, else the first "
+            "--outcome where one is, else the parameters.",
+            show_default=False,
         ),
-    ] = "parameters",
+    ] = None,
     rival: Annotated[list[str] | None, typer.Option(metavar="EFFECT", help="An effect to be told from others.")] = None,
     sobol: Annotated[bool, typer.Option("--sobol", help="Sobol indices also where the outcome is linear.")] = False,
     draws: Annotated[int, typer.Option(min=1000, metavar="N", help="Draws of all parameters.")] = 2000,
@@ -250,6 +252,7 @@ def sensitivity(
         raise typer.BadParameter("a test plan needs both --candidates and --budget", param_hint="--budget")
     from gyromodel._study_files import print_sensitivity, run_sensitivity
 
+    criterion = criterion or ("discrimination" if rival else "outcome" if outcome else "parameters")
     found, result, chosen = run_sensitivity(
         models, plan, design, outcome or [], candidates, budget, criterion, rival or [], sobol, draws, seed
     )
