@@ -205,6 +205,23 @@ def reading_parts(path: Path) -> Iterator[tuple[dict[str, str], dict[str, Any], 
         yield None
 
 
+def read_metadata(path: Path) -> Mapping[str, Any]:
+    """The metadata of a campaign file without its samples; may raise what `read_campaign` turns into one sentence."""
+    suffix = _suffix(path)
+    if suffix == ".zarr":
+        import zarr
+
+        return zarr.open_group(path, mode="r").attrs
+    if suffix == ".nc":
+        import h5py
+
+        with h5py.File(path, "r") as file:
+            return dict(file.attrs)
+    with reading_parts(path) as opened:
+        assert opened is not None
+        return opened[1]
+
+
 def _write_parquet(campaign: Campaign, path: Path) -> None:
     import pyarrow as pa
     from pyarrow import parquet

@@ -19,8 +19,8 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from gyromodel import CampaignError, cli, files
-from gyromodel.batch import Entry, entries, run_batch
+from gyromodel import CampaignError, cli, compensate, export_calibration, files
+from gyromodel.batch import Entry, entries, pooled_table, read_results, run_batch, unit_statistics, write_table
 from gyromodel.batch import _results as storage
 from gyromodel.batch import _run as running
 from gyromodel.batch import _work as work
@@ -380,6 +380,28 @@ def test_archives_of_every_kind(tmp_path: Path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(CampaignError, match="no campaign in it"):
         entries(str(tmp_path / "empty"))
+
+
+def test_what_commands_have_written_is_no_campaign(tmp_path: Path):
+    """Tables, an exported calibration and compensated copies, in the archive's folder; a damaged file is told of."""
+    place = archive(tmp_path, 3)
+    for name in ("archive/results.parquet", "archive/other.parquet"):
+        assert (here(tmp_path, name).examined, here(tmp_path, name).examined) == (3, 0)
+    found = read_results(place / "other.parquet")
+    write_table(pooled_table(found, unit_statistics(found)), place / "pooled.parquet")
+    parquet.write_table(pa.table({"campaign": ["c000.csv"]}), place / "list.parquet")
+    calibration = fit(campaign(0), read_model(tmp_path / "model.yaml")).calibration()
+    (place / "calibration.csv").write_text(export_calibration(calibration, "csv"))
+    for suffix in files.SUFFIXES:
+        write_campaign(compensate(campaign(0), calibration), place / f"copy{suffix}")
+    write_campaign(campaign(1).with_metadata({"navigated": "yes"}), place / "way.csv")
+    for pattern, count in ((None, 3), (place / "*.*", 2)):
+        (place / "results.parquet").unlink(missing_ok=True)
+        done = here(tmp_path, "archive/results.parquet", where=pattern)
+        assert (done.campaigns, done.failed) == (count, 0)
+    (place / "cut.parquet").write_bytes(b"PAR1")
+    (place / "cut.csv.gz").write_bytes(b"")
+    assert here(tmp_path, "archive/other.parquet").failed == 2
 
 
 def test_links_neither_double_nor_lose_a_campaign(tmp_path: Path):
