@@ -349,9 +349,11 @@ def batch(
         print(json_text(result), end="")
     else:
         print(f"{done.campaigns} campaigns, {done.examined} examined in this run; {len(done.table)} rows in {output}")
-    if done.references:
-        named = ", ".join(f"{effect} to {text}" for effect, (_, text) in done.references.items())
-        print(f"gyromodel: all campaigns refer {named} (reference: in the model sets another)", file=sys.stderr)
+    has = {name.partition(".")[0] for name in filter(None, done.table["parameter"].unique().to_pylist())}
+    points = {key: text for key, (_, text) in done.references.items() if key.partition(".")[0] in has}
+    if points:
+        named = ", ".join(f"{key}: {text}" for key, text in points.items())
+        print(f"gyromodel: for all campaigns {named} (stated in the model, others count)", file=sys.stderr)
     if done.failed:
         print(f"gyromodel: {done.failed} of {done.campaigns} campaigns failed: see column reason", file=sys.stderr)
         sys.exit(1)

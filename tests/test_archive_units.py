@@ -27,11 +27,11 @@ def drawn(
     table = {
         "campaign": [f"c{i}" for i in range(n)], "axis": [None] * n, "parameter": ["bias.value"] * n,
         "value": value, "std": std, "unit": ["deg/h"] * n, "serial": [f"U{u}" for u in unit], "date": [None] * n,
-        "status": ["fitted"] * n, "data_hash": [f"d{i}" for i in range(n)],
+        "reason": [None] * n, "data_hash": [f"d{i}" for i in range(n)],
     }  # fmt: skip
     return pa.table(table, pa.schema([("campaign", pa.string()), ("axis", pa.string()), ("parameter", pa.string()),
         ("value", pa.float64()), ("std", pa.float64()), ("unit", pa.string()), ("serial", pa.string()),
-        ("date", pa.string()), ("status", pa.string()), ("data_hash", pa.string())])), true  # fmt: skip
+        ("date", pa.string()), ("reason", pa.string()), ("data_hash", pa.string())])), true  # fmt: skip
 
 
 def statistics(table: pa.Table) -> Parameter:
@@ -103,7 +103,7 @@ def test_units_of_measure_change_nothing_and_failures_are_left_out(seed: int):
     first = statistics(table)
     for name in ("value", "std"):
         table = table.set_column(table.column_names.index(name), name, pa.array(table[name].to_numpy() / 3600))
-    lost = table.slice(0, 1).set_column(table.column_names.index("status"), "status", pa.array(["failed"]))
+    lost = table.slice(0, 1).set_column(table.column_names.index("reason"), "reason", pa.array(["no rate"]))
     table = pa.concat_tables([table, lost])
     second = statistics(table)
     assert second.campaigns == 12

@@ -24,6 +24,7 @@ from gyromodel.batch import Entry, entries, pooled_table, read_results, run_batc
 from gyromodel.batch import _results as storage
 from gyromodel.batch import _run as running
 from gyromodel.batch import _work as work
+from gyromodel.batch._references import referred
 from gyromodel.campaign import Campaign
 from gyromodel.estimate import fit
 from gyromodel.files import write_campaign
@@ -524,10 +525,86 @@ def test_biases_of_an_archive_are_of_one_temperature(tmp_path: Path):
     for k in range(4):
         measured(k, f"c{k}.csv")
     first = here(tmp_path)
-    assert set(first.references) == {"bias_temperature"}
+    assert {row["reason"] for row in first.table.to_pylist()} == {None}
+    assert set(first.references) == {"bias_temperature.reference"}
     measured(5, "a5.csv")
     done = here(tmp_path)
     assert (done.examined, done.references) == (1, first.references)
     found = [row for row in done.table.to_pylist() if row["parameter"] == "bias.value"]
-    expected = 3 + 0.2 * (first.references["bias_temperature"][0] - 20)
+    expected = 3 + 0.2 * (first.references["bias_temperature.reference"][0] - 20)
     assert max(abs(row["value"] - expected) / row["std"] for row in found) < 5
+
+
+RATED = """effects: [{effect: scale_factor}, {effect: bias%s}, {effect: %s%s}]
+noise: [{effect: noise_white, value: 0.0028 deg/sqrt(h)}]
+"""
+
+
+@pytest.mark.parametrize(
+    ("effect", "more", "points"),
+    [
+        ("bias_temperature", "", {"reference": "50 degC"}),
+        ("bias_temperature_curve", ", coefficients: [1 deg/h, 1 deg/h]", {"reference": "-30 degC"}),
+        ("scale_temperature", "", {"reference": "50 degC"}),
+        ("scale_nonlinearity", "", {"full_rate": "7 deg/s"}),
+    ],
+)
+def test_a_result_is_told_at_other_points_as_if_fitted_at_them(
+    tmp_path: Path, effect: str, more: str, points: dict[str, str]
+):
+    """Values, and the covariance of all parameters."""
+    rate = np.repeat(np.linspace(-10.0, 10.0, 12), 5)
+    rated = campaign(0).with_column("rate", rate, "deg/s")
+    rated = rated.with_column("output", 3600 * rate + campaign(0).columns["output"], "deg/h")
+    estimates = []
+    for stated in ("", "".join(f", {name}: {text}" for name, text in points.items())):
+        (tmp_path / "model.yaml").write_text(RATED % ("", effect, more + stated))
+        estimates.append(fit(rated, read_model(tmp_path / "model.yaml")))
+    own, expected = estimates
+    places = {f"{effect}.{name}": float(getattr(expected.model.effects[2], name)) for name in points}
+    model, covariance, common = referred(own, {key: (value, "") for key, value in places.items()})
+    assert common
+    std = np.sqrt(np.diag(expected.covariance))
+    assert np.asarray(model.vector()) == pytest.approx(
+        np.asarray(expected.model.vector()), abs=1e-4 * std.min(), rel=1e-6
+    )
+    assert covariance / np.outer(std, std) == pytest.approx(expected.covariance / np.outer(std, std), abs=1e-4)
+
+
+def test_what_cannot_be_told_at_other_points_does_not_compare(tmp_path: Path):
+    """Knots elsewhere make another curve, and a bias that is fixed cannot be that of another temperature."""
+    rate = np.linspace(-10.0, 10.0, 60)
+    rated = campaign(0).with_column("rate", rate, "deg/s")
+    rated = rated.with_column("output", 3600 * rate + campaign(0).columns["output"], "deg/h")
+    for effect, fixed, key in (
+        ("scale_spline", "", "full_rate"),
+        ("bias_temperature", ", value: 3 deg/h, fixed: true", "reference"),
+    ):
+        (tmp_path / "model.yaml").write_text(RATED % (fixed, effect, ""))
+        estimate = fit(rated, read_model(tmp_path / "model.yaml"))
+        model, _, common = referred(estimate, {f"{effect}.{key}": (0.1, "")})
+        assert not common
+        assert model is estimate.model
+
+
+@pytest.mark.long
+def test_what_a_diagnosis_adds_is_of_one_temperature_too(tmp_path: Path):
+    """Like gyros measured at other temperatures, whose simulation knows a bias alone."""
+    (tmp_path / "archive").mkdir()
+    for k in range(3):
+        warmer = np.array(campaign(k).columns["temperature"]) + 10 * k
+        output = campaign(k).columns["output"] + 0.2 * 10 * k
+        changed = campaign(k).with_column("temperature", warmer, "degC").with_column("output", output, "deg/h")
+        write_campaign(changed, tmp_path / "archive" / f"c{k}.csv")
+    (tmp_path / "model.yaml").write_text("effects: [{effect: bias}]\n")
+    start = read_model(tmp_path / "model.yaml")
+    done = run_batch(str(tmp_path / "archive"), start, "m", tmp_path / "r.parquet", diagnosing=True)
+    rows = done.table.to_pylist()
+    assert {row["causes"] for row in rows} == {"bias_temperature"}
+    assert done.references["bias_temperature.reference"][1] == "20 degC"
+    for row in rows:
+        if row["parameter"] == "bias.value":
+            assert abs(row["value"] - 3) < 5 * row["std"]
+    assert {s.parameter: s.campaigns for s in unit_statistics(done.table)}["bias.value"] == 3
+    kept = done.table.set_column(done.table.column_names.index("reason"), "reason", pa.array(["own"] * len(rows)))
+    assert unit_statistics(kept) == []
