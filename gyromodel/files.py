@@ -268,6 +268,9 @@ def _read_zarr(path: Path) -> Contents:
 
     with _damage("Zarr"):
         for name, array in zarr.open_group(path, mode="r").arrays():
+            # Before a value is read: codecs of objects may run what is in the file.
+            if array.dtype.kind not in "iuf":
+                raise CampaignError(f"column '{name}' holds {array.dtype}, expected numbers")
             # Zarr reads a chunk that is not there as fill values, which would pass for missing samples.
             if missing := array.nchunks - array.nchunks_initialized:
                 raise CampaignError(

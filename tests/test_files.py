@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import gzip
+import json
 import os
+import pickle
 import shutil
 import subprocess
 import sys
@@ -228,6 +230,36 @@ def test_a_zarr_copy_that_lacks_a_chunk(tmp_path: Path):
     shutil.rmtree(tmp_path / "a.zarr" / "output" / "c")
     with pytest.raises(CampaignError, match="column 'output' lacks 1 of 1 chunks: the copy is not complete"):
         read_campaign(tmp_path / "a.zarr")
+
+
+class Runs:
+    """A pickle of it makes a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __reduce__(self) -> Any:
+        return os.mkdir, (str(self.folder),)
+
+
+@pytest.mark.parametrize("column", ["time", "output"])
+def test_a_pickle_in_a_zarr_file_is_not_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, column: str):
+    """As numcodecs may, which has a codec for it."""
+    monkeypatch.setattr("numcodecs.pickles.Pickle.decode", lambda self, data, out=None: pickle.loads(bytes(data)))
+    path = tmp_path / "a.zarr"
+    whole = {"zarr_format": 2, "shape": [6], "chunks": [6], "compressor": None, "fill_value": None, "order": "C"}
+    kinds: dict[str, Any] = {name: {"dtype": "<f8", "filters": None} for name in ("time", "output")}
+    kinds[column] = {"dtype": "|O", "filters": [{"id": "vlen-utf8"}, {"id": "pickle"}]}
+    for name, kind in kinds.items():
+        (path / name).mkdir(parents=True)
+        (path / name / ".zarray").write_text(json.dumps(whole | kind))
+        (path / name / ".zattrs").write_text('{"units": "s", "_ARRAY_DIMENSIONS": ["time"]}')
+        (path / name / "0").write_bytes(np.arange(6.0).tobytes())
+    (path / ".zgroup").write_text('{"zarr_format": 2}')
+    (path / column / "0").write_bytes(pickle.dumps(Runs(tmp_path / "made")))
+    with pytest.raises(CampaignError, match=f"column '{column}' holds .*, expected numbers"):
+        read_campaign(path)
+    assert not (tmp_path / "made").exists()
 
 
 def test_hdf5_texts_with_a_wrong_length(tmp_path: Path):
