@@ -267,6 +267,9 @@ def _read_zarr(path: Path) -> Contents:
     import zarr
 
     with _damage("Zarr"):
+        for folder in path.iterdir():
+            if folder.is_dir() and not (folder.name.startswith(".") or is_zarr(folder)):
+                raise CampaignError(f"column {shown(folder.name)} lacks its description: the copy is not complete")
         for name, array in zarr.open_group(path, mode="r").arrays():
             # Before a value is read: codecs of objects may run what is in the file.
             if array.dtype.kind not in "iuf":

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pyarrow as pa
 import pytest
+from pyarrow import parquet
 from scipy.stats import binom
 
-from gyromodel.batch import Parameter, copies, pooled_table, unit_statistics
+from gyromodel import CampaignError
+from gyromodel.batch import Parameter, copies, pooled_table, read_results, unit_statistics
+from gyromodel.batch._results import SCHEMA
 
 RARE = 1e-5
 
@@ -148,3 +153,15 @@ def test_two_units_are_enough(units: int, campaigns: int, seed: int):
         mean += abs(found.mean - 40) < 2 * found.mean_std
         assert not found.outliers
     assert min(covered, mean) >= binom.ppf(RARE, archives, 0.93), f"seed {seed}: {covered}, {mean} of {archives}"
+
+
+@pytest.mark.parametrize("name", SCHEMA.names)
+def test_a_table_that_was_changed_is_refused(tmp_path: Path, name: str):
+    """A column renamed; what was added does no harm."""
+    whole = pa.Table.from_pylist([], SCHEMA).replace_schema_metadata({"gyromodel": "{}"})
+    parquet.write_table(whole.append_column("note", pa.array([], pa.string())), tmp_path / "r.parquet")
+    assert read_results(tmp_path / "r.parquet").equals(whole)
+    other = whole.rename_columns({name: f"{name}_old"}).replace_schema_metadata(whole.schema.metadata)
+    parquet.write_table(other, tmp_path / "r.parquet")
+    with pytest.raises(CampaignError, match=f"no longer the table that was written: .*{name}"):
+        read_results(tmp_path / "r.parquet")

@@ -230,6 +230,9 @@ def test_a_zarr_copy_that_lacks_a_chunk(tmp_path: Path):
     shutil.rmtree(tmp_path / "a.zarr" / "output" / "c")
     with pytest.raises(CampaignError, match="column 'output' lacks 1 of 1 chunks: the copy is not complete"):
         read_campaign(tmp_path / "a.zarr")
+    (tmp_path / "a.zarr" / "temperature" / "zarr.json").unlink()
+    with pytest.raises(CampaignError, match="column 'temperature' lacks its description: the copy is not complete"):
+        read_campaign(tmp_path / "a.zarr")
 
 
 class Runs:

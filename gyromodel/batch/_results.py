@@ -178,7 +178,10 @@ def read_results(path: Path) -> pa.Table:
         raise CampaignError(f"{path}: is no table of results, or cannot be read") from error
     if MADE_BY not in (table.schema.metadata or {}):
         raise CampaignError(f"{path}: is no table of results")
-    return table
+    try:
+        return table.select(SCHEMA.names).cast(SCHEMA).replace_schema_metadata(table.schema.metadata)
+    except (KeyError, ValueError, pa.ArrowException) as error:
+        raise CampaignError(f"{path}: is no longer the table that was written: {error.args[0]}") from error
 
 
 def write_table(table: pa.Table, path: Path) -> None:
