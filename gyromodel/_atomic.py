@@ -35,7 +35,11 @@ def sibling(target: Path) -> Iterator[Path]:
                     _remove(left)
             fcntl.flock(folder, fcntl.LOCK_SH | fcntl.LOCK_NB)
         held.callback(_remove, temporary)
-        yield temporary
+        try:
+            yield temporary
+        except OSError as error:
+            error.filename = str(target)  # as a full disk names nothing
+            raise
 
 
 def replace_folder(temporary: Path, target: Path) -> None:

@@ -335,7 +335,9 @@ def _write_netcdf(campaign: Campaign, path: Path) -> None:
         "chunksizes": (min(len(campaign), 1 << 16),),
     }
     encoding = dict.fromkeys(campaign.columns, chunk)
-    _dataset(campaign).to_netcdf(path, engine="h5netcdf", encoding=encoding)
+    # HDF5 ends the process where a disk is full: it writes to memory, and Python to the disk.
+    with open(path, "xb") as file:
+        file.write(_dataset(campaign).to_netcdf(engine="h5netcdf", encoding=encoding))
 
 
 def _write_zarr(campaign: Campaign, path: Path) -> None:

@@ -6,6 +6,7 @@ import gzip
 import json
 import os
 import pickle
+import re
 import shutil
 import subprocess
 import sys
@@ -115,6 +116,40 @@ def test_a_failed_write_leaves_what_was_there(tmp_path: Path, monkeypatch: pytes
         write_campaign(small_campaign(serial="008"), path)
     assert os.listdir(tmp_path) == ["a.csv"]
     assert read_campaign(path).equals(small_campaign())
+
+
+FULL = """
+import resource, sys
+from gyromodel.files import write_campaign
+from gyromodel import CampaignError
+from pathlib import Path
+from gyromodel._atomic import write_text
+from tests.helpers import small_campaign
+write_campaign(small_campaign(), "warm" + sys.argv[1])
+resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
+try:
+    write_campaign(small_campaign(serial="008"), "a" + sys.argv[1])
+except CampaignError as error:
+    print(error)
+try:
+    write_text(Path("a.txt"), "long " * 100)
+except OSError as error:
+    print(error.filename)
+"""
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_a_disk_that_is_full_ends_in_a_sentence(tmp_path: Path, suffix: str):
+    """As a limit of the size of files makes it, in the libraries' own code too."""
+    write_campaign(small_campaign(), tmp_path / f"a{suffix}")
+    done = subprocess.run(
+        [sys.executable, "-c", FULL, suffix], capture_output=True, text=True, check=False, cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])},
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    assert re.fullmatch(rf"a{re.escape(suffix)}: cannot be written: .*File too large\na\.txt\n", done.stdout)
+    assert read_campaign(tmp_path / f"a{suffix}").equals(small_campaign())
+    assert {*os.listdir(tmp_path)} == {f"a{suffix}", f"warm{suffix}"}
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".zarr"])
