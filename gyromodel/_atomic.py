@@ -71,7 +71,7 @@ def _exchange(one: Path, other: Path) -> None:
 def _remove(path: Path) -> None:
     if path.is_dir():
         shutil.rmtree(path)
-    else:
+    elif os.path.lexists(path):  # on a read-only disk not even what is absent can be removed
         path.unlink(missing_ok=True)
 
 
