@@ -38,7 +38,8 @@ def sibling(target: Path) -> Iterator[Path]:
         try:
             yield temporary
         except OSError as error:
-            error.filename = str(target)  # as a full disk names nothing
+            if error.errno:
+                error.filename = str(target)  # a full disk names nothing
             raise
 
 

@@ -370,6 +370,9 @@ def test_archives_of_every_kind(tmp_path: Path):
     assert [e.campaign for e in entries(str(folder / "group.zarr"))] == ["deep/unit2.zarr", "unit1.zarr"]
     found = entries(f"{folder}/**/*.csv*")
     assert [Path(e.path).name for e in found] == ["one.csv", "two.csv.gz"]
+    (folder / "notes.txt").unlink()
+    for pattern in ("**", "**/*"):
+        assert [e.campaign for e in entries(f"{folder}/{pattern}")] == [f"{folder}/{name}" for name in inside]
     manifest = folder / "list.parquet"
     parquet.write_table(pa.table({"campaign": ["x/two.csv.gz", "one.csv"]}), manifest)
     assert entries(str(manifest)) == [

@@ -62,7 +62,7 @@ def entries(archive: str, but: Path | None = None) -> list[Entry]:
     elif root.is_file():
         found = [Entry(root.name, str(root.resolve()))]
     else:
-        found = _measured(_each_once(_matching(root)))
+        found = _measured(_each_once(_campaigns_among(_matching(root))))
         if not found and not glob.has_magic(archive):
             raise CampaignError(f"{archive}: there is no such folder or file")
     if but is not None:
@@ -107,6 +107,15 @@ def _each_once(paths: Iterable[Path]) -> list[Entry]:
     return sorted(Entry(name, real) for real, (_, _, name) in found.items())
 
 
+def _campaigns_among(paths: Iterable[Path]) -> Iterator[Path]:
+    """Files, and Zarr groups that hold no further ones in place of their parts."""
+    for path in paths:
+        if is_zarr(path):
+            yield from () if _is_array(path) else _groups_below(path)
+        elif not path.is_dir() and not any(map(is_zarr, path.parents)):
+            yield path
+
+
 def _matching(pattern: Path) -> list[Path]:
     """What a pattern names: as `glob` does, which never ends where links below `**` lead round in circles."""
     if "**" not in pattern.parts:
@@ -115,7 +124,7 @@ def _matching(pattern: Path) -> list[Path]:
     tops, rest = _matching(Path(*pattern.parts[:place])), pattern.parts[place + 1 :] or ("*",)
     folders = [folder for top in tops for folder, _, _ in _walked(top)]
     found = [path for folder in folders for path in _matching(Path(glob.escape(folder), *rest))]
-    return [path for path in found if is_zarr(path) or not path.is_dir()]
+    return found
 
 
 def _walked(root: Path) -> Iterator[tuple[str, list[str], list[str]]]:
