@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -31,8 +32,15 @@ def machine() -> str:
     versions = ", ".join(f"{name} {version(name)}" for name in ("jax", "numpy"))
     return (
         f"{os.cpu_count()} cores ({model}) shared with other work (load average {os.getloadavg()[0]:.1f} at the end), "
-        f"{memory:.0f} GiB, no GPU, Python {platform.python_version()}, {versions}"
+        f"{memory:.0f} GiB, {gpu() or 'no GPU'}, Python {platform.python_version()}, {versions}"
     )
+
+
+@cache
+def gpu() -> str:
+    """The GPU that JAX computes on here; empty without one."""
+    ask = "import jax; d = jax.devices()[0]; print(d.device_kind if d.platform == 'gpu' else '')"
+    return subprocess.run([sys.executable, "-c", ask], stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
 
 
 def peak_memory() -> int:

@@ -2,9 +2,10 @@
 
     python -m benchmarks.batch_fits
 
-writes benchmarks/results/batch_fits.md. Campaigns are drawn from the fitted model with white noise; peers are given the
-model's structured columns as their Jacobian, compiled, and parameters scaled by their typical sizes, but for one row of
-optimistix with the parameters as the model holds them. Every measurement runs in a process of its own.
+writes benchmarks/results/batch_fits.md; `benchmarks.batch_cost` says how the cost grows, and what it is on a GPU.
+Campaigns are drawn from the fitted model with white noise; peers are given the model's structured columns as their
+Jacobian, compiled, and parameters scaled by their typical sizes, but for one row of optimistix with the parameters as
+the model holds them. Every measurement runs in a process of its own.
 """
 
 from __future__ import annotations
@@ -311,7 +312,9 @@ def main(argv: list[str] | None = None) -> None:
         return
 
     def run(*call: Any, **environment: str) -> Any:
-        return in_fresh_process("benchmarks.batch_fits", "--only", json.dumps(call), **environment)
+        return in_fresh_process(
+            "benchmarks.batch_fits", "--only", json.dumps(call), **{"JAX_PLATFORMS": "cpu"} | environment
+        )
 
     count = args.campaigns
     with tempfile.TemporaryDirectory() as empty:
@@ -326,10 +329,8 @@ def main(argv: list[str] | None = None) -> None:
     asked = ("vmap", False), ("vmap", True), ("map", True)
     batches = {(over, scaled): run("stock", 12, over, scaled) for over, scaled in asked}
     passes = {p: run("one_pass", p) for p in (12, 40)}
-    by_samples = {n: run("ours", 12, 16, (n, n)) for n in (512, 4096, 32768, 262144)}
-    by_count = {n: run("ours", 12, n) for n in sorted({max(count // 100, 1), max(count // 10, 1), count})}
     far = {tau: run("far_start", min(count, 200), tau) for tau in (5.0, 60000.0)}
-    lines = _page(ragged, mine, loops, alike, exact, batches, passes, compiled, by_samples, by_count, far)
+    lines = _page(ragged, mine, loops, alike, exact, batches, passes, compiled, far)
     write_result("batch_fits", "An archive of campaigns fitted", "batch_fits", argv, lines)
 
 
@@ -344,7 +345,7 @@ def _met(value: float, must: float, above: bool) -> str:
     return f"{value:.3g} (must: {'≥' if above else '≤'} {must:g}, {'met' if met else '**missed**'})"
 
 
-def _page(ragged, mine, loops, alike, exact, batches, passes, compiled, by_samples, by_count, far) -> list[str]:
+def _page(ragged, mine, loops, alike, exact, batches, passes, compiled, far) -> list[str]:
     per_fit = {p: {k: mine[p][k] / ragged[p] for k in ("wall", "cpu", "without restarts")} for p in mine}
     rows = []
     for p in (12, 40):
@@ -440,30 +441,6 @@ def _page(ragged, mine, loops, alike, exact, batches, passes, compiled, by_sampl
         f"takes {batches['vmap', True]['temporary'] / 1e6:.0f} MB for {STOCK} campaigns under vmap. While {ragged[12]} "
         "campaigns were fitted the largest resident memory rose by "
         f"{(mine[12]['peak'] - mine[12]['before']) / MIB:.0f} MiB.",
-        "",
-        "## Cost over samples and campaigns",
-        "",
-        *table(
-            ["samples", "campaigns", "processor ms a fit", "µs a sample and iteration"],
-            [
-                [
-                    str(n),
-                    "16",
-                    f"{1e3 * r['without restarts'] / 16:.2f}",
-                    f"{1e6 * r['without restarts'] / r['samples'] / r['iterations']:.3f}",
-                ]
-                for n, r in by_samples.items()
-            ]
-            + [
-                [
-                    "about 5000",
-                    str(n),
-                    f"{1e3 * r['without restarts'] / n:.2f}",
-                    f"{1e6 * r['without restarts'] / r['samples'] / r['iterations']:.3f}",
-                ]
-                for n, r in by_count.items()
-            ],
-        ),
     ]
     return lines
 

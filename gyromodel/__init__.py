@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import os
 import sys
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
+# Not from typing, which would be the first thing that a command waits for.
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from gyromodel._checks import CampaignError as CampaignError
     from gyromodel.campaign import Campaign as Campaign
@@ -80,7 +80,9 @@ else:
     os.environ["JAX_ENABLE_X64"] = "1"
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
+    from importlib import import_module
+
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'gyromodel' has no attribute {name!r}")
     value = getattr(import_module(f"gyromodel.{_MODULE_OF[name]}"), name)

@@ -16,8 +16,6 @@ import typer
 if TYPE_CHECKING:
     from gyromodel.campaign import Campaign
 
-# Exit status after Ctrl-C, as of typer and shells.
-INTERRUPTED = 130
 # Errors that mean "the data or the model cannot answer", by the module that defines them.
 _REFUSALS = {
     "gyromodel._checks": "CampaignError",

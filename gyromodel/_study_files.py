@@ -34,12 +34,16 @@ def run_sensitivity(
     result = found.to_dict()
     if not parts:
         return found, result, None
-    leading = found.results[0].budget
+    gyros, leading = known(calibrated), found.results[0].budget
+    # Of three units alike, each is measured by itself.
+    jacobian = leading.jacobian.reshape(-1, len(gyros.vector))
     choice = best_plan(
-        known(calibrated), parts, seconds(time), criterion, jacobian=leading.jacobian, rivals=rivals,
+        gyros, parts, seconds(time), criterion, jacobian=jacobian, rivals=rivals,
         instruments=instruments if other is None else errors,
     )  # fmt: skip
     plain = {"criterion": choice.criterion, "gain": choice.gain}
+    if criterion == "outcome":
+        plain["outcome"] = leading.outcome
     for name, each in (("best", choice.best), ("equal", choice.equal)):
         plain[name] = {"times": each.times, "duration": each.duration, "separation": each.separation}
     return found, result | {"plan": plain}, choice
@@ -83,4 +87,4 @@ def print_sensitivity(found: Sensitivity, choice: PlanChoice | None) -> None:
         print_table(("then", "test"), test_rows(found))
         print(found.instrument_to_improve() or "No instrument would buy anything.")
     if choice:
-        print(f"\n{plan_sentence(choice)}")
+        print(f"\n{plan_sentence(choice, leading.outcome)}")

@@ -12,10 +12,10 @@ from typing import Annotated, Literal
 import typer
 
 import gyromodel
+from gyromodel.__main__ import INTERRUPTED
 from gyromodel._atomic import write_text
 from gyromodel._compiling import keep_compiled, switch_compiler
 from gyromodel._console import (
-    INTERRUPTED,
     interrupts_kept,
     json_text,
     prepare_folder,
@@ -45,7 +45,11 @@ Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of the random dra
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line; ends with the exit status of the contract: 0 done, 1 cannot answer, 2 wrong usage."""
+    """Run the command line; ends with the exit status of the contract: 0 done, 1 cannot answer, 2 wrong usage.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C, which `__main__` tells of.
+    """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")  # an equation's ε must not stop a terminal that lacks it
@@ -57,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             typer.main.get_command(app)(args=arguments, prog_name="gyromodel")
     except SystemExit as end:
         if end.code == INTERRUPTED:
-            print("gyromodel: interrupted; no file is half written, and batch goes on where it was", file=sys.stderr)
+            raise KeyboardInterrupt from None
         raise
     except Exception as error:
         if os.environ.get("GYROMODEL_DEBUG") == "1":
@@ -230,11 +234,13 @@ def sensitivity(
     ] = None,
     budget: Annotated[str | None, typer.Option(metavar="TIME", help='Time for that plan, such as "4 h".')] = None,
     criterion: Annotated[
-        Literal["parameters", "outcome", "discrimination"],
+        Literal["parameters", "outcome", "discrimination"] | None,
         typer.Option(
-            help="What that plan is best for: parameters, the first outcome, or telling --rival effects apart."
+            help="What that plan is best for: telling --rival effects apart where some are given, else the first "
+            "--outcome where one is, else the parameters.",
+            show_default=False,
         ),
-    ] = "parameters",
+    ] = None,
     rival: Annotated[list[str] | None, typer.Option(metavar="EFFECT", help="An effect to be told from others.")] = None,
     sobol: Annotated[bool, typer.Option("--sobol", help="Sobol indices also where the outcome is linear.")] = False,
     draws: Annotated[int, typer.Option(min=1000, metavar="N", help="Draws of all parameters.")] = 2000,
@@ -246,6 +252,7 @@ def sensitivity(
         raise typer.BadParameter("a test plan needs both --candidates and --budget", param_hint="--budget")
     from gyromodel._study_files import print_sensitivity, run_sensitivity
 
+    criterion = criterion or ("discrimination" if rival else "outcome" if outcome else "parameters")
     found, result, chosen = run_sensitivity(
         models, plan, design, outcome or [], candidates, budget, criterion, rival or [], sobol, draws, seed
     )
@@ -342,9 +349,11 @@ def batch(
         print(json_text(result), end="")
     else:
         print(f"{done.campaigns} campaigns, {done.examined} examined in this run; {len(done.table)} rows in {output}")
-    if done.references:
-        named = ", ".join(f"{effect} to {text}" for effect, (_, text) in done.references.items())
-        print(f"gyromodel: all campaigns refer {named} (reference: in the model sets another)", file=sys.stderr)
+    has = {name.partition(".")[0] for name in filter(None, done.table["parameter"].unique().to_pylist())}
+    points = {key: text for key, (_, text) in done.references.items() if key.partition(".")[0] in has}
+    if points:
+        named = ", ".join(f"{key}: {text}" for key, text in points.items())
+        print(f"gyromodel: for all campaigns {named} (stated in the model, others count)", file=sys.stderr)
     if done.failed:
         print(f"gyromodel: {done.failed} of {done.campaigns} campaigns failed: see column reason", file=sys.stderr)
         sys.exit(1)

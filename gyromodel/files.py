@@ -10,7 +10,6 @@ import gzip
 import math
 import mmap
 import os
-import shutil
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -19,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from gyromodel._atomic import sibling
+from gyromodel._atomic import replace_folder, sibling
 from gyromodel._checks import CampaignError, check_unit, shown
 from gyromodel._csv import (
     Contents,
@@ -113,15 +112,7 @@ def replacing(target: Path) -> Iterator[Path]:
         with sibling(path) as temporary:
             yield temporary
             if path.is_dir():
-                # A folder cannot be replaced in one step: the old one steps aside first.
-                aside = temporary.with_suffix(".old")
-                os.replace(path, aside)
-                try:
-                    os.replace(temporary, path)
-                except OSError:
-                    os.replace(aside, path)
-                    raise
-                shutil.rmtree(aside)
+                replace_folder(temporary, path)
             else:
                 os.replace(temporary, path)
     except OSError as error:
@@ -214,6 +205,23 @@ def reading_parts(path: Path) -> Iterator[tuple[dict[str, str], dict[str, Any], 
         yield None
 
 
+def read_metadata(path: Path) -> Mapping[str, Any]:
+    """The metadata of a campaign file without its samples; may raise what `read_campaign` turns into one sentence."""
+    suffix = _suffix(path)
+    if suffix == ".zarr":
+        import zarr
+
+        return zarr.open_group(path, mode="r").attrs
+    if suffix == ".nc":
+        import h5py
+
+        with h5py.File(path, "r") as file:
+            return dict(file.attrs)
+    with reading_parts(path) as opened:
+        assert opened is not None
+        return opened[1]
+
+
 def _write_parquet(campaign: Campaign, path: Path) -> None:
     import pyarrow as pa
     from pyarrow import parquet
@@ -259,7 +267,13 @@ def _read_zarr(path: Path) -> Contents:
     import zarr
 
     with _damage("Zarr"):
+        for folder in path.iterdir():
+            if folder.is_dir() and not (folder.name.startswith(".") or is_zarr(folder)):
+                raise CampaignError(f"column {shown(folder.name)} lacks its description: the copy is not complete")
         for name, array in zarr.open_group(path, mode="r").arrays():
+            # Before a value is read: codecs of objects may run what is in the file.
+            if array.dtype.kind not in "iuf":
+                raise CampaignError(f"column '{name}' holds {array.dtype}, expected numbers")
             # Zarr reads a chunk that is not there as fill values, which would pass for missing samples.
             if missing := array.nchunks - array.nchunks_initialized:
                 raise CampaignError(
@@ -321,7 +335,9 @@ def _write_netcdf(campaign: Campaign, path: Path) -> None:
         "chunksizes": (min(len(campaign), 1 << 16),),
     }
     encoding = dict.fromkeys(campaign.columns, chunk)
-    _dataset(campaign).to_netcdf(path, engine="h5netcdf", encoding=encoding)
+    # HDF5 ends the process where a disk is full: it writes to memory, and Python to the disk.
+    with open(path, "xb") as file:
+        file.write(_dataset(campaign).to_netcdf(engine="h5netcdf", encoding=encoding))
 
 
 def _write_zarr(campaign: Campaign, path: Path) -> None:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pyarrow as pa
 import pytest
+from pyarrow import parquet
 from scipy.stats import binom
 
-from gyromodel.batch import Parameter, copies, pooled_table, unit_statistics
+from gyromodel import CampaignError
+from gyromodel.batch import Parameter, copies, pooled_table, read_results, unit_statistics
+from gyromodel.batch._results import SCHEMA
 
 RARE = 1e-5
 
@@ -27,11 +32,11 @@ def drawn(
     table = {
         "campaign": [f"c{i}" for i in range(n)], "axis": [None] * n, "parameter": ["bias.value"] * n,
         "value": value, "std": std, "unit": ["deg/h"] * n, "serial": [f"U{u}" for u in unit], "date": [None] * n,
-        "status": ["fitted"] * n, "data_hash": [f"d{i}" for i in range(n)],
+        "reason": [None] * n, "data_hash": [f"d{i}" for i in range(n)],
     }  # fmt: skip
     return pa.table(table, pa.schema([("campaign", pa.string()), ("axis", pa.string()), ("parameter", pa.string()),
         ("value", pa.float64()), ("std", pa.float64()), ("unit", pa.string()), ("serial", pa.string()),
-        ("date", pa.string()), ("status", pa.string()), ("data_hash", pa.string())])), true  # fmt: skip
+        ("date", pa.string()), ("reason", pa.string()), ("data_hash", pa.string())])), true  # fmt: skip
 
 
 def statistics(table: pa.Table) -> Parameter:
@@ -103,7 +108,7 @@ def test_units_of_measure_change_nothing_and_failures_are_left_out(seed: int):
     first = statistics(table)
     for name in ("value", "std"):
         table = table.set_column(table.column_names.index(name), name, pa.array(table[name].to_numpy() / 3600))
-    lost = table.slice(0, 1).set_column(table.column_names.index("status"), "status", pa.array(["failed"]))
+    lost = table.slice(0, 1).set_column(table.column_names.index("reason"), "reason", pa.array(["no rate"]))
     table = pa.concat_tables([table, lost])
     second = statistics(table)
     assert second.campaigns == 12
@@ -148,3 +153,15 @@ def test_two_units_are_enough(units: int, campaigns: int, seed: int):
         mean += abs(found.mean - 40) < 2 * found.mean_std
         assert not found.outliers
     assert min(covered, mean) >= binom.ppf(RARE, archives, 0.93), f"seed {seed}: {covered}, {mean} of {archives}"
+
+
+@pytest.mark.parametrize("name", SCHEMA.names)
+def test_a_table_that_was_changed_is_refused(tmp_path: Path, name: str):
+    """A column renamed; what was added does no harm."""
+    whole = pa.Table.from_pylist([], SCHEMA).replace_schema_metadata({"gyromodel": "{}"})
+    parquet.write_table(whole.append_column("note", pa.array([], pa.string())), tmp_path / "r.parquet")
+    assert read_results(tmp_path / "r.parquet").equals(whole)
+    other = whole.rename_columns({name: f"{name}_old"}).replace_schema_metadata(whole.schema.metadata)
+    parquet.write_table(other, tmp_path / "r.parquet")
+    with pytest.raises(CampaignError, match=f"no longer the table that was written: .*{name}"):
+        read_results(tmp_path / "r.parquet")

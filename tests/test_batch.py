@@ -19,11 +19,12 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from gyromodel import CampaignError, cli, files
-from gyromodel.batch import Entry, entries, run_batch
+from gyromodel import CampaignError, cli, compensate, export_calibration, files
+from gyromodel.batch import Entry, entries, pooled_table, read_results, run_batch, unit_statistics, write_table
 from gyromodel.batch import _results as storage
 from gyromodel.batch import _run as running
 from gyromodel.batch import _work as work
+from gyromodel.batch._references import referred
 from gyromodel.campaign import Campaign
 from gyromodel.estimate import fit
 from gyromodel.files import write_campaign
@@ -243,7 +244,7 @@ def test_a_full_disk_leaves_what_is_there(tmp_path: Path, monkeypatch: pytest.Mo
 
 LOST = """
 import gc, signal
-from gyromodel import _archive_files, cli
+from gyromodel import __main__, _archive_files
 def interrupt(*_):
     gc.callbacks.remove(interrupt)
     signal.raise_signal(signal.SIGINT)
@@ -251,7 +252,7 @@ def run(*arguments, whole=_archive_files.run_batch, **options):
     gc.callbacks.append(interrupt)
     return whole(*arguments, **options)
 _archive_files.run_batch = run
-cli.main()
+__main__.main()
 """
 
 
@@ -307,6 +308,53 @@ def test_a_worker_that_dies_loses_nothing(tmp_path: Path):
     assert len({(row["campaign"], row["parameter"]) for row in rows}) == len(rows) == 24 * 5
 
 
+@pytest.mark.long
+def test_a_scheduler_that_dies_loses_nothing(tmp_path: Path):
+    """One sentence, no row of what it had not finished, and the next run ends with the rows of one left alone."""
+    archive(tmp_path, 40)
+    assert batch(tmp_path, results="whole.parquet")[0] == 0
+    dask = [sys.executable, "-m", "distributed.cli"]
+    where, quiet = tmp_path / "scheduler.json", {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(where)]
+    scheduler = subprocess.Popen([*dask[:2], f"{dask[2]}.dask_scheduler", *options], **quiet)
+    while not where.exists():
+        time.sleep(0.02)
+    address = json.loads(where.read_text())["address"]
+    options = ["--nthreads", "1", "--no-nanny", "--no-dashboard"]
+    worker = subprocess.Popen([*dask[:2], f"{dask[2]}.dask_worker", address, *options], **quiet, cwd=tmp_path)
+    command = [sys.executable, "-m", "gyromodel", "batch", str(tmp_path / "archive"), "--scheduler", address]
+    options = ["--model", str(tmp_path / "model.yaml"), "-o", str(tmp_path / "results.parquet")]
+    process = subprocess.Popen([*command, *options], stderr=subprocess.PIPE, text=True)
+    parts = tmp_path / ".results.parquet.parts"
+    try:
+        while process.poll() is None and not list(parts.glob("*.parquet")):
+            time.sleep(0.02)
+        scheduler.kill()
+        said = process.communicate(timeout=60)[1]
+    finally:
+        for each in (process, worker, scheduler):
+            each.kill()
+            each.wait()
+    assert process.returncode == 1
+    assert said == f"gyromodel: {address}: the Dask scheduler was lost; the same command goes on from here\n"
+    rows = [row for part in parts.glob("*.parquet") for row in parquet.read_table(part).to_pylist()]
+    finished = {row["campaign"] for row in rows}
+    assert {row["status"] for row in rows} == {"fitted"}
+    status, result = batch(tmp_path)
+    assert (status, result["examined"]) == (0, 40 - len(finished))
+    assert parquet.read_table(tmp_path / "results.parquet").equals(parquet.read_table(tmp_path / "whole.parquet"))
+
+
+def test_parts_without_a_row_that_counts_merge(tmp_path: Path):
+    """What failed for the machine alone is in a part of its own, and done again later."""
+    head = dict.fromkeys(("campaign", "status", "file_state"), "m")
+    with storage.Results(tmp_path / "results.parquet", {"model": "m"}) as kept:
+        for status in ("failed", "fitted"):
+            kept.add([head | {"status": status}])
+            kept.flush()
+        assert kept.merge([Entry("m", "/m")])["status"].to_pylist() == ["fitted"]
+
+
 def test_archives_of_every_kind(tmp_path: Path):
     folder = tmp_path / "a"
     (folder / "x" / ".hidden").mkdir(parents=True)
@@ -322,6 +370,9 @@ def test_archives_of_every_kind(tmp_path: Path):
     assert [e.campaign for e in entries(str(folder / "group.zarr"))] == ["deep/unit2.zarr", "unit1.zarr"]
     found = entries(f"{folder}/**/*.csv*")
     assert [Path(e.path).name for e in found] == ["one.csv", "two.csv.gz"]
+    (folder / "notes.txt").unlink()
+    for pattern in ("**", "**/*"):
+        assert [e.campaign for e in entries(f"{folder}/{pattern}")] == [f"{folder}/{name}" for name in inside]
     manifest = folder / "list.parquet"
     parquet.write_table(pa.table({"campaign": ["x/two.csv.gz", "one.csv"]}), manifest)
     assert entries(str(manifest)) == [
@@ -333,6 +384,28 @@ def test_archives_of_every_kind(tmp_path: Path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(CampaignError, match="no campaign in it"):
         entries(str(tmp_path / "empty"))
+
+
+def test_what_commands_have_written_is_no_campaign(tmp_path: Path):
+    """Tables, an exported calibration and compensated copies, in the archive's folder; a damaged file is told of."""
+    place = archive(tmp_path, 3)
+    for name in ("archive/results.parquet", "archive/other.parquet"):
+        assert (here(tmp_path, name).examined, here(tmp_path, name).examined) == (3, 0)
+    found = read_results(place / "other.parquet")
+    write_table(pooled_table(found, unit_statistics(found)), place / "pooled.parquet")
+    parquet.write_table(pa.table({"campaign": ["c000.csv"]}), place / "list.parquet")
+    calibration = fit(campaign(0), read_model(tmp_path / "model.yaml")).calibration()
+    (place / "calibration.csv").write_text(export_calibration(calibration, "csv"))
+    for suffix in files.SUFFIXES:
+        write_campaign(compensate(campaign(0), calibration), place / f"copy{suffix}")
+    write_campaign(campaign(1).with_metadata({"navigated": "yes"}), place / "way.csv")
+    for pattern, count in ((None, 3), (place / "*.*", 2)):
+        (place / "results.parquet").unlink(missing_ok=True)
+        done = here(tmp_path, "archive/results.parquet", where=pattern)
+        assert (done.campaigns, done.failed) == (count, 0)
+    (place / "cut.parquet").write_bytes(b"PAR1")
+    (place / "cut.csv.gz").write_bytes(b"")
+    assert here(tmp_path, "archive/other.parquet").failed == 2
 
 
 def test_links_neither_double_nor_lose_a_campaign(tmp_path: Path):
@@ -455,10 +528,86 @@ def test_biases_of_an_archive_are_of_one_temperature(tmp_path: Path):
     for k in range(4):
         measured(k, f"c{k}.csv")
     first = here(tmp_path)
-    assert set(first.references) == {"bias_temperature"}
+    assert {row["reason"] for row in first.table.to_pylist()} == {None}
+    assert set(first.references) == {"bias_temperature.reference"}
     measured(5, "a5.csv")
     done = here(tmp_path)
     assert (done.examined, done.references) == (1, first.references)
     found = [row for row in done.table.to_pylist() if row["parameter"] == "bias.value"]
-    expected = 3 + 0.2 * (first.references["bias_temperature"][0] - 20)
+    expected = 3 + 0.2 * (first.references["bias_temperature.reference"][0] - 20)
     assert max(abs(row["value"] - expected) / row["std"] for row in found) < 5
+
+
+RATED = """effects: [{effect: scale_factor}, {effect: bias%s}, {effect: %s%s}]
+noise: [{effect: noise_white, value: 0.0028 deg/sqrt(h)}]
+"""
+
+
+@pytest.mark.parametrize(
+    ("effect", "more", "points"),
+    [
+        ("bias_temperature", "", {"reference": "50 degC"}),
+        ("bias_temperature_curve", ", coefficients: [1 deg/h, 1 deg/h]", {"reference": "-30 degC"}),
+        ("scale_temperature", "", {"reference": "50 degC"}),
+        ("scale_nonlinearity", "", {"full_rate": "7 deg/s"}),
+    ],
+)
+def test_a_result_is_told_at_other_points_as_if_fitted_at_them(
+    tmp_path: Path, effect: str, more: str, points: dict[str, str]
+):
+    """Values, and the covariance of all parameters."""
+    rate = np.repeat(np.linspace(-10.0, 10.0, 12), 5)
+    rated = campaign(0).with_column("rate", rate, "deg/s")
+    rated = rated.with_column("output", 3600 * rate + campaign(0).columns["output"], "deg/h")
+    estimates = []
+    for stated in ("", "".join(f", {name}: {text}" for name, text in points.items())):
+        (tmp_path / "model.yaml").write_text(RATED % ("", effect, more + stated))
+        estimates.append(fit(rated, read_model(tmp_path / "model.yaml")))
+    own, expected = estimates
+    places = {f"{effect}.{name}": float(getattr(expected.model.effects[2], name)) for name in points}
+    model, covariance, common = referred(own, {key: (value, "") for key, value in places.items()})
+    assert common
+    std = np.sqrt(np.diag(expected.covariance))
+    assert np.asarray(model.vector()) == pytest.approx(
+        np.asarray(expected.model.vector()), abs=1e-4 * std.min(), rel=1e-6
+    )
+    assert covariance / np.outer(std, std) == pytest.approx(expected.covariance / np.outer(std, std), abs=1e-4)
+
+
+def test_what_cannot_be_told_at_other_points_does_not_compare(tmp_path: Path):
+    """Knots elsewhere make another curve, and a bias that is fixed cannot be that of another temperature."""
+    rate = np.linspace(-10.0, 10.0, 60)
+    rated = campaign(0).with_column("rate", rate, "deg/s")
+    rated = rated.with_column("output", 3600 * rate + campaign(0).columns["output"], "deg/h")
+    for effect, fixed, key in (
+        ("scale_spline", "", "full_rate"),
+        ("bias_temperature", ", value: 3 deg/h, fixed: true", "reference"),
+    ):
+        (tmp_path / "model.yaml").write_text(RATED % (fixed, effect, ""))
+        estimate = fit(rated, read_model(tmp_path / "model.yaml"))
+        model, _, common = referred(estimate, {f"{effect}.{key}": (0.1, "")})
+        assert not common
+        assert model is estimate.model
+
+
+@pytest.mark.long
+def test_what_a_diagnosis_adds_is_of_one_temperature_too(tmp_path: Path):
+    """Like gyros measured at other temperatures, whose simulation knows a bias alone."""
+    (tmp_path / "archive").mkdir()
+    for k in range(3):
+        warmer = np.array(campaign(k).columns["temperature"]) + 10 * k
+        output = campaign(k).columns["output"] + 0.2 * 10 * k
+        changed = campaign(k).with_column("temperature", warmer, "degC").with_column("output", output, "deg/h")
+        write_campaign(changed, tmp_path / "archive" / f"c{k}.csv")
+    (tmp_path / "model.yaml").write_text("effects: [{effect: bias}]\n")
+    start = read_model(tmp_path / "model.yaml")
+    done = run_batch(str(tmp_path / "archive"), start, "m", tmp_path / "r.parquet", diagnosing=True)
+    rows = done.table.to_pylist()
+    assert {row["causes"] for row in rows} == {"bias_temperature"}
+    assert done.references["bias_temperature.reference"][1] == "20 degC"
+    for row in rows:
+        if row["parameter"] == "bias.value":
+            assert abs(row["value"] - 3) < 5 * row["std"]
+    assert {s.parameter: s.campaigns for s in unit_statistics(done.table)}["bias.value"] == 3
+    kept = done.table.set_column(done.table.column_names.index("reason"), "reason", pa.array(["own"] * len(rows)))
+    assert unit_statistics(kept) == []

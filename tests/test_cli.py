@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -127,6 +128,28 @@ def test_help_lists_every_command(run: Run):
     shown = run("--help")
     assert shown.status == 0
     assert all(f"\n  {command} " in shown.out for command in COMMANDS)
+
+
+STARTING = """
+import signal, sys
+loading = sys.argv.pop()
+class Finder:
+    def find_spec(self, name, *_):
+        if name == loading:
+            sys.meta_path.remove(self)
+            eval("signal.raise_signal(signal.SIGINT)")
+sys.meta_path.insert(0, Finder())
+from gyromodel.__main__ import main
+main()
+"""
+
+
+@pytest.mark.parametrize("loading", ["gyromodel.cli", "typer", "jax"])
+def test_ctrl_c_ends_in_one_sentence_from_the_first_import_on(tmp_path: Path, loading: str):
+    command = [sys.executable, "-c", STARTING, "allan", "no.csv", "-o", str(tmp_path), loading]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 130, done.stderr
+    assert re.fullmatch("gyromodel: interrupted; .*\n", done.stderr)
 
 
 def test_the_module_runs_as_a_program():

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import gzip
+import json
 import os
+import pickle
+import re
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -114,6 +118,40 @@ def test_a_failed_write_leaves_what_was_there(tmp_path: Path, monkeypatch: pytes
     assert read_campaign(path).equals(small_campaign())
 
 
+FULL = """
+import resource, sys
+from gyromodel.files import write_campaign
+from gyromodel import CampaignError
+from pathlib import Path
+from gyromodel._atomic import write_text
+from tests.helpers import small_campaign
+write_campaign(small_campaign(), "warm" + sys.argv[1])
+resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
+try:
+    write_campaign(small_campaign(serial="008"), "a" + sys.argv[1])
+except CampaignError as error:
+    print(error)
+try:
+    write_text(Path("a.txt"), "long " * 100)
+except OSError as error:
+    print(error.filename)
+"""
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_a_disk_that_is_full_ends_in_a_sentence(tmp_path: Path, suffix: str):
+    """As a limit of the size of files makes it, in the libraries' own code too."""
+    write_campaign(small_campaign(), tmp_path / f"a{suffix}")
+    done = subprocess.run(
+        [sys.executable, "-c", FULL, suffix], capture_output=True, text=True, check=False, cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])},
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    assert re.fullmatch(rf"a{re.escape(suffix)}: cannot be written: .*File too large\na\.txt\n", done.stdout)
+    assert read_campaign(tmp_path / f"a{suffix}").equals(small_campaign())
+    assert {*os.listdir(tmp_path)} == {f"a{suffix}", f"warm{suffix}"}
+
+
 @pytest.mark.parametrize("suffix", [".csv", ".zarr"])
 def test_what_a_killed_write_left_goes_with_the_next(tmp_path: Path, suffix: str):
     """Of the same target only, and not what another run is writing."""
@@ -132,6 +170,49 @@ def test_what_a_killed_write_left_goes_with_the_next(tmp_path: Path, suffix: str
         (tmp_path / "c.csv").touch()
     write_campaign(small_campaign(), path)
     assert {*tmp_path.iterdir()} == {path, tmp_path / "c.csv", *others}
+
+
+KILLED = """
+import os, shutil, sys
+from gyromodel import _atomic, files
+from tests.helpers import small_campaign
+def killing(whole, left=[int(sys.argv[2])]):
+    def step(*arguments, **options):
+        done = whole(*arguments, **options)
+        left[0] -= 1
+        if not left[0]:
+            os.kill(os.getpid(), 9)
+        return done
+    return step
+os.replace, _atomic._exchange, shutil.rmtree = map(killing, (os.replace, _atomic._exchange, shutil.rmtree))
+if len(sys.argv) > 3:
+    def _exchange(*_):
+        raise OSError(22, "Invalid argument")
+    _atomic._exchange = _exchange
+files.write_campaign(small_campaign(serial="008"), sys.argv[1])
+"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("swaps", [True, False])
+def test_a_folder_killed_at_any_step_of_its_replacement_is_there(tmp_path: Path, swaps: bool):
+    """Without a swap in one step, it is from the next write on, even of one that fails."""
+    path, steps = tmp_path / "a.zarr", 0
+    while True:
+        write_campaign(small_campaign(), path)
+        steps += 1
+        command = [sys.executable, "-c", KILLED, str(path), str(steps), *([] if swaps else ["x"])]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode == 0:
+            break
+        assert done.returncode == -9, done.stderr
+        if not swaps:
+            with suppress(RuntimeError), replacing(path):
+                raise RuntimeError
+        assert read_campaign(path).metadata["serial"] in ("007", "008")
+        write_campaign(small_campaign(), path)
+        assert os.listdir(tmp_path) == ["a.zarr"]
+    assert steps > (2 if swaps else 4)
 
 
 def test_where_nothing_can_be_written(tmp_path: Path):
@@ -184,6 +265,39 @@ def test_a_zarr_copy_that_lacks_a_chunk(tmp_path: Path):
     shutil.rmtree(tmp_path / "a.zarr" / "output" / "c")
     with pytest.raises(CampaignError, match="column 'output' lacks 1 of 1 chunks: the copy is not complete"):
         read_campaign(tmp_path / "a.zarr")
+    (tmp_path / "a.zarr" / "temperature" / "zarr.json").unlink()
+    with pytest.raises(CampaignError, match="column 'temperature' lacks its description: the copy is not complete"):
+        read_campaign(tmp_path / "a.zarr")
+
+
+class Runs:
+    """A pickle of it makes a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __reduce__(self) -> Any:
+        return os.mkdir, (str(self.folder),)
+
+
+@pytest.mark.parametrize("column", ["time", "output"])
+def test_a_pickle_in_a_zarr_file_is_not_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, column: str):
+    """As numcodecs may, which has a codec for it."""
+    monkeypatch.setattr("numcodecs.pickles.Pickle.decode", lambda self, data, out=None: pickle.loads(bytes(data)))
+    path = tmp_path / "a.zarr"
+    whole = {"zarr_format": 2, "shape": [6], "chunks": [6], "compressor": None, "fill_value": None, "order": "C"}
+    kinds: dict[str, Any] = {name: {"dtype": "<f8", "filters": None} for name in ("time", "output")}
+    kinds[column] = {"dtype": "|O", "filters": [{"id": "vlen-utf8"}, {"id": "pickle"}]}
+    for name, kind in kinds.items():
+        (path / name).mkdir(parents=True)
+        (path / name / ".zarray").write_text(json.dumps(whole | kind))
+        (path / name / ".zattrs").write_text('{"units": "s", "_ARRAY_DIMENSIONS": ["time"]}')
+        (path / name / "0").write_bytes(np.arange(6.0).tobytes())
+    (path / ".zgroup").write_text('{"zarr_format": 2}')
+    (path / column / "0").write_bytes(pickle.dumps(Runs(tmp_path / "made")))
+    with pytest.raises(CampaignError, match=f"column '{column}' holds .*, expected numbers"):
+        read_campaign(path)
+    assert not (tmp_path / "made").exists()
 
 
 def test_hdf5_texts_with_a_wrong_length(tmp_path: Path):

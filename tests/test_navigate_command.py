@@ -53,6 +53,7 @@ def test_a_body_over_one_place_stays_there(turning: float, tmp_path: Path, capsy
     expected = Rotation.from_rotvec([0.0, turning * STEP * (ROWS - 1), 0.0]) * START
     assert (end * expected.inv()).magnitude() < 1e-6
     assert json.loads(capsys.readouterr().out)["rows"] == ROWS
+    assert "navigated" in made.metadata
 
 
 def in_other_unit(campaign: Campaign, columns: str, unit: str, kind: str) -> Campaign:

@@ -317,7 +317,7 @@ def test_a_plan_beside_one_that_tells_nothing_apart_has_no_ratio():
     choice = best_plan(known(calibration), parts, 2 * ROWS * STEP, "discrimination", rivals=rivals)
     assert choice.equal.times == {"cold": 1, "warm": 1}
     assert choice.gain == np.inf
-    said = plan_sentence(choice)
+    said = plan_sentence(choice, "angle")
     assert f"lie {choice.best.separation:.3g} standard deviations apart; each part in turn does not" in said
 
 
@@ -421,6 +421,29 @@ def test_the_command_writes_what_it_prints(files: Path, capsys: pytest.CaptureFi
     assert run(*common[:3], "--outcome", "angle", "--json") == 0
     again = json.loads(capsys.readouterr().out)
     assert again["outcomes"] == written["outcomes"]
+
+
+def test_a_test_plan_is_best_for_what_was_asked(files: Path, capsys: pytest.CaptureFixture[str]):
+    """For the first outcome where one is named; three units alike, as navigation needs them, are each measured."""
+    text = PLAN.replace("kind: rate", "kind: rate\nlatitude_deg: 50").replace(
+        "from: 20 degC, to: 60", "from: 59 degC, to: 60"
+    )
+    (files / "warm.yaml").write_text(text, encoding="utf-8")
+    common = [files / "model.yaml", "--plan", files / "warm.yaml", "--candidates", files / "candidates.yaml"]
+    common += ["--budget", "4 h", "--json"]
+    found = {}
+    for more in ((), ("--outcome", "rate"), ("--outcome", "attitude", "--outcome", "rate"), ("--rival", "bias_drift")):
+        status = run(*common, *more)
+        said = capsys.readouterr()
+        found[more] = json.loads(said.out)["plan"] if status == 0 else said.err
+    plain, rate, attitude, rivals = found.values()
+    assert "two rival effects" in rivals
+    assert (plain["criterion"], rate["criterion"], rate["outcome"], attitude["outcome"]) == (
+        "parameters", "outcome", "rate", "attitude"
+    )  # fmt: skip
+    # All of the mission is warm: so are the parts that serve it, where parameters want both ends.
+    assert plain["best"]["times"]["cold"] > rate["best"]["times"].get("cold", 0)
+    assert attitude["best"]["times"] == rate["best"]["times"]
 
 
 @pytest.mark.parametrize(

@@ -6,11 +6,17 @@ import glob
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 from gyromodel._checks import CampaignError
-from gyromodel.files import SUFFIXES, is_zarr
+from gyromodel.files import SUFFIXES, is_zarr, read_metadata
+
+# Metadata of campaigns that commands have computed columns for: copies, and no measurements.
+COMPUTED = ("rate_estimated_std_holds", "navigated")
+# What an exported calibration begins with.
+EXPORTED = b"effect,kind,name,"
 
 
 class Entry(NamedTuple):
@@ -47,7 +53,7 @@ def entries(archive: str, but: Path | None = None) -> list[Entry]:
     """
     root = Path(archive)
     if root.is_dir() and not is_zarr(root):
-        found = _named(_campaigns_below(root), root)
+        found = _measured(_named(_campaigns_below(root), root))
     elif root.is_dir():
         groups = _groups_below(root)
         found = _named(groups, root) if groups != [root] else [Entry(root.name, str(root.resolve()))]
@@ -56,7 +62,7 @@ def entries(archive: str, but: Path | None = None) -> list[Entry]:
     elif root.is_file():
         found = [Entry(root.name, str(root.resolve()))]
     else:
-        found = _each_once(_matching(root))
+        found = _measured(_each_once(_campaigns_among(_matching(root))))
         if not found and not glob.has_magic(archive):
             raise CampaignError(f"{archive}: there is no such folder or file")
     if but is not None:
@@ -73,6 +79,24 @@ def _named(paths: Iterable[Path], root: Path) -> list[Entry]:
     return [Entry(Path(name).relative_to(root).as_posix(), path) for name, path in _each_once(paths)]
 
 
+def _measured(found: Iterable[Entry]) -> list[Entry]:
+    """Without what commands have written; a damaged file stays, as its row will say what is wrong with it."""
+    return [entry for entry in found if not _is_result(Path(entry.path))]
+
+
+def _is_result(path: Path) -> bool:
+    name = path.name.lower()
+    with suppress(Exception):
+        if name.endswith(".parquet") and _manifest(path) is not None:
+            return True
+        if name.endswith(".csv"):
+            with open(path, "rb") as file:
+                if file.read(len(EXPORTED)) == EXPORTED:
+                    return True
+        return not read_metadata(path).keys().isdisjoint(COMPUTED)
+    return False
+
+
 def _each_once(paths: Iterable[Path]) -> list[Entry]:
     """Sorted by name; what several names lead to has that without a link, else the one of the fewest folders."""
     found: dict[str, tuple[bool, int, str]] = {}
@@ -83,6 +107,15 @@ def _each_once(paths: Iterable[Path]) -> list[Entry]:
     return sorted(Entry(name, real) for real, (_, _, name) in found.items())
 
 
+def _campaigns_among(paths: Iterable[Path]) -> Iterator[Path]:
+    """Files, and Zarr groups that hold no further ones in place of their parts."""
+    for path in paths:
+        if is_zarr(path):
+            yield from () if _is_array(path) else _groups_below(path)
+        elif not path.is_dir() and not any(map(is_zarr, path.parents)):
+            yield path
+
+
 def _matching(pattern: Path) -> list[Path]:
     """What a pattern names: as `glob` does, which never ends where links below `**` lead round in circles."""
     if "**" not in pattern.parts:
@@ -91,7 +124,7 @@ def _matching(pattern: Path) -> list[Path]:
     tops, rest = _matching(Path(*pattern.parts[:place])), pattern.parts[place + 1 :] or ("*",)
     folders = [folder for top in tops for folder, _, _ in _walked(top)]
     found = [path for folder in folders for path in _matching(Path(glob.escape(folder), *rest))]
-    return [path for path in found if is_zarr(path) or not path.is_dir()]
+    return found
 
 
 def _walked(root: Path) -> Iterator[tuple[str, list[str], list[str]]]:

@@ -126,7 +126,8 @@ class Results:
         for i, table in enumerate(self._tables):
             names = table["campaign"].to_pylist()
             rows = [k for k, name in enumerate(names) if source[name] == i and name in place]
-            kept.append(table.take(rows).append_column("_place", pa.array([place[names[k]] for k in rows], pa.int64())))
+            places = pa.array([place[names[k]] for k in rows], pa.int64())
+            kept.append(table.take(pa.array(rows, pa.int64())).append_column("_place", places))
         # The sort keeps equal ones as they are: parameters stay in the order of the model.
         whole = pa.concat_tables(kept)
         order_of = sorted(range(len(whole)), key=whole["_place"].to_pylist().__getitem__)
@@ -177,7 +178,10 @@ def read_results(path: Path) -> pa.Table:
         raise CampaignError(f"{path}: is no table of results, or cannot be read") from error
     if MADE_BY not in (table.schema.metadata or {}):
         raise CampaignError(f"{path}: is no table of results")
-    return table
+    try:
+        return table.select(SCHEMA.names).cast(SCHEMA).replace_schema_metadata(table.schema.metadata)
+    except (KeyError, ValueError, pa.ArrowException) as error:
+        raise CampaignError(f"{path}: is no longer the table that was written: {error.args[0]}") from error
 
 
 def write_table(table: pa.Table, path: Path) -> None:

@@ -20,8 +20,9 @@ import pyarrow as pa
 import gyromodel
 from gyromodel._checks import CampaignError
 from gyromodel.batch._archive import Entry, entries
+from gyromodel.batch._references import References, open_references, with_references
 from gyromodel.batch._results import Results, made_by_of
-from gyromodel.batch._work import Lot, Row, examine, failed, open_references, read, with_references
+from gyromodel.batch._work import Lot, Row, examine, failed, read
 from gyromodel.model import GyroModel
 
 # Lots that wait at each worker, so that none is idle, and times that one may lose its worker.
@@ -37,15 +38,15 @@ RECENT = 60.0
 class Batch(NamedTuple):
     """Results of an archive: the table, and how many campaigns there were, were examined in this run, and failed.
 
-    `references` holds the reference points that the model left open and all campaigns share, by effect: in internal
-    units, and as a text.
+    `references` holds the reference points that the model left open and all campaigns share, by effect and setting: in
+    internal units, and as a text.
     """
 
     table: pa.Table
     campaigns: int
     examined: int
     failed: int
-    references: dict[str, tuple[float, str]]
+    references: References
 
 
 def run_batch(
@@ -64,7 +65,7 @@ def run_batch(
     A campaign that cannot be read or fitted is a row with the reason. Campaigns that an earlier run has finished, and
     that have not changed since, are not examined again, unless the machine was at fault and not the data; those that
     are gone from the archive leave the table. Reference points that the model leaves open are those of the first
-    campaign in all, so that their parameters compare.
+    campaign in all, so that their parameters compare; so are those of effects that a diagnosis adds.
 
     Args:
         archive: see `entries`.
@@ -89,7 +90,8 @@ def run_batch(
     }
     # As before: the first campaign may be another one now.
     before = json.loads(made_by_of(results).get("references", "{}"))
-    references = {name: (value, text) for name, (value, text) in before.items()} or open_references(every, model)
+    references = {key: (value, text) for key, (value, text) in before.items()}
+    references = references or open_references(every, model, diagnosing)
     if references:
         made_by["references"] = json.dumps(references)
         model = with_references(model, references)
@@ -100,7 +102,7 @@ def run_batch(
         # What takes longer by itself than reading does is kept apart: finished work is on disk within a second.
         most = 1 if diagnosing or not model.noise else MOST
         lots = [
-            Lot(tuple(some), tuple(states[entry] for entry in some), model, model_hash, diagnosing)
+            Lot(tuple(some), tuple(states[entry] for entry in some), model, model_hash, diagnosing, references)
             for some in _parted(todo, states, most)
         ]
         say = _Pace(progress, len(every), len(every) - len(todo))
@@ -144,10 +146,12 @@ def _here(lots: Sequence[Lot]) -> Iterator[tuple[Lot, list[Row]]]:
 def _on_cluster(lots: Sequence[Lot], workers: int, scheduler: str | None) -> Iterator[tuple[Lot, list[Row]]]:
     """Rows of each lot as it ends, whatever becomes of single workers."""
     from dask.config import set as configured
-    from distributed import Client, LocalCluster, as_completed
+    from distributed import CancelledError, Client, LocalCluster, as_completed
+    from distributed.client import ClosedClientError
 
     # Its warnings, and its tracebacks while it ends, are of no use to who waits for a table.
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     with configured({"distributed.scheduler.allowed-failures": LOST}), ExitStack() as open_ones:
         if scheduler is None:
             quiet = {"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
@@ -166,18 +170,26 @@ def _on_cluster(lots: Sequence[Lot], workers: int, scheduler: str | None) -> Ite
             return list(new)
 
         ahead = WAITING * max(workers, len(client.scheduler_info()["workers"]))
-        running = as_completed(submitted(ahead))
-        for future in running:
-            lot = of.pop(future.key)
-            if future.status == "finished":
-                yield lot, future.result()
-            elif len(lot.entries) > 1:
-                # One of them may be what no worker survives.
-                both = zip(lot.entries, lot.states, strict=True)
-                waiting += [lot._replace(entries=(entry,), states=(state,)) for entry, state in both]
-            else:
-                yield lot, [failed(lot.heads()[0], future.exception())]
-            running.update(submitted(1))
+        try:
+            running = as_completed(submitted(ahead))
+            for future in running:
+                # Without its scheduler a client cancels what it waits for, and would wait for ever for anything new.
+                if future.status == "cancelled" or client.status != "running":
+                    raise CancelledError
+                lot = of.pop(future.key)
+                if future.status == "finished":
+                    yield lot, future.result()
+                elif len(lot.entries) > 1:
+                    # One of them may be what no worker survives.
+                    both = zip(lot.entries, lot.states, strict=True)
+                    waiting += [lot._replace(entries=(entry,), states=(state,)) for entry, state in both]
+                else:
+                    yield lot, [failed(lot.heads()[0], future.exception())]
+                running.update(submitted(1))
+        except (CancelledError, ClosedClientError, OSError):
+            raise CampaignError(
+                f"{scheduler}: the Dask scheduler was lost; the same command goes on from here"
+            ) from None
 
 
 @contextmanager

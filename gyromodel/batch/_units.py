@@ -114,7 +114,8 @@ def pooled_table(results: pa.Table, statistics: Sequence[Parameter]) -> pa.Table
 def unit_statistics(results: pa.Table) -> list[Parameter]:
     """Statistics of every parameter with standard uncertainties in a table of results.
 
-    Campaigns of one `serial` are of one unit, and one without is of a unit of its own. `copies` count once.
+    Campaigns of one `serial` are of one unit, and one without is of a unit of its own. `copies` count once, and rows
+    with a `reason` not.
 
     Args:
         results: as `run_batch` writes them.
@@ -148,9 +149,9 @@ class _Rows(NamedTuple):
 
 def _by_parameter(results: pa.Table) -> Iterator[_Rows]:
     frame = results.select(
-        ["campaign", "axis", "parameter", "value", "std", "unit", "serial", "date", "status"]
+        ["campaign", "axis", "parameter", "value", "std", "unit", "serial", "date", "reason"]
     ).to_pandas()
-    usable = (frame["status"] != "failed") & (frame["std"] > 0) & np.isfinite(frame["value"])
+    usable = frame["reason"].isna() & (frame["std"] > 0) & np.isfinite(frame["value"])
     frame = frame[usable & ~frame["campaign"].isin(copies(results))]
     frame["serial"] = frame["serial"].where(frame["serial"].notna(), frame["campaign"])
     frame["axis"] = frame["axis"].fillna("")

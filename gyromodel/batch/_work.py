@@ -3,70 +3,30 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 import gyromodel
 from gyromodel._checks import CampaignError
-from gyromodel._yaml import exact_text
 from gyromodel.batch._archive import Entry
+from gyromodel.batch._references import References, referred
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis import diagnose
 from gyromodel.estimate import EstimateError, calibration_of, fit, fit_many, noise_table, read_for_fit
 from gyromodel.files import read_campaign
 from gyromodel.model import GyroModel, ModelError
-from gyromodel.model_files import setting_unit
 from gyromodel.signals import Record
 from gyromodel.units import UnitError
 
 Row = dict[str, Any]
 # What a campaign or a model that cannot answer raises; anything else is a fault of ours, and told as one.
 REFUSALS = (CampaignError, EstimateError, ModelError, UnitError)
-
-
+# Why parameters do not compare with those of other campaigns.
+OWN = "told at reference points of this campaign's own"
 # Rows beyond which a campaign is fitted by itself: those fitted together are held in memory side by side.
 LONGEST = 1 << 16
-
-
-def open_references(every: Sequence[Entry], model: GyroModel) -> dict[str, tuple[float, str]]:
-    """Reference points that the model leaves open, by effect: those of the first campaign that has them.
-
-    With its own in each campaign, a bias would be that of another temperature every time.
-
-    Returns:
-        Each in internal units, and as a text.
-    """
-    unset = [effect.label for effect in model.effects if np.isnan(float(getattr(effect, "reference", 0.0)))]
-    for entry in every if unset else ():
-        try:
-            campaign = read_campaign(entry.path)
-            if len(campaign.outputs) > 1:
-                campaign = campaign.axis(campaign.outputs[0].removeprefix("output_"))
-            record = read_for_fit([campaign])
-            prepared = model.prepared(record.signals)
-        except Exception:
-            continue
-        found = [effect for effect in prepared.effects if effect.label in unset]
-        values = [float(effect.reference) for effect in found]  # type: ignore[attr-defined]
-        texts = [str(exact_text(v, setting_unit(e, "reference", record))) for e, v in zip(found, values, strict=True)]
-        if np.isfinite(values).all():
-            return dict(zip([effect.label for effect in found], zip(values, texts, strict=True), strict=True))
-    return {}
-
-
-def with_references(model: GyroModel, references: Mapping[str, tuple[float, str]]) -> GyroModel:
-    """The model with these reference points."""
-    effects = tuple(
-        eqx.tree_at(lambda e: e.reference, effect, jnp.asarray(references[effect.label][0]))
-        if effect.label in references
-        else effect
-        for effect in model.effects
-    )
-    return eqx.tree_at(lambda m: m.effects, model, effects)
 
 
 class Lot(NamedTuple):
@@ -77,6 +37,7 @@ class Lot(NamedTuple):
     model: GyroModel
     model_hash: str
     diagnosing: bool
+    references: References
 
     def heads(self) -> list[Row]:
         """What is known of each before it is read."""
@@ -165,18 +126,19 @@ def _rows(one: Ready, lot: Lot) -> list[Row]:
         if lot.diagnosing:
             diagnosis = diagnose(campaign, lot.model)
             estimate = diagnosis.extended
+            model, covariance, common = referred(estimate, lot.references)
             head = head | {
                 "status": "diagnosed",
                 "verdict": diagnosis.verdict,
                 "causes": ", ".join(cause.effect for cause in diagnosis.causes),
                 "gain_ratio": _known(diagnosis.gain.ratio),
+                "reason": None if common else OWN,
             }
         else:
             estimate = fit(campaign, lot.model)
+            model, covariance = estimate.model, estimate.covariance
             head = head | {"status": "fitted"}
-        return _parameters(
-            head, estimate.record, estimate.model, estimate.covariance, estimate.iterations, estimate.noise_interval
-        )
+        return _parameters(head, estimate.record, model, covariance, estimate.iterations, estimate.noise_interval)
     except Exception as error:  # one campaign must not end the run
         return [failed(one.head, error)]
 

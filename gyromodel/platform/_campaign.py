@@ -41,7 +41,7 @@ def navigate_campaign(campaign: Campaign) -> Campaign:
             and, where they are not zero, `longitude_deg` and `height_m`. The body starts at rest over the Earth.
 
     Returns:
-        The campaign with its attitude replaced and velocity and position added.
+        The campaign with its attitude replaced, velocity and position added, and metadata `navigated`.
 
     Raises:
         CampaignError: something of that is missing or no such thing, samples are missing or uneven, the first second
@@ -90,7 +90,7 @@ def navigate_campaign(campaign: Campaign) -> Campaign:
         campaign = campaign.with_column(name, values, "")
     for (name, unit), values in zip(WRITTEN.items(), np.column_stack(whole[1:]).T, strict=True):
         campaign = campaign.with_column(name, values, unit)
-    return campaign
+    return campaign.with_metadata({"navigated": "attitude, velocity and position are computed from outputs and forces"})
 
 
 def _check_rest(name: str, begin: Navigation, force: np.ndarray) -> None:
