@@ -12,17 +12,19 @@ import json
 import sys
 from collections.abc import Callable
 from importlib.util import find_spec
+from itertools import product
 from typing import Any
 
 import numpy as np
 
 from benchmarks._measure import MIB, in_fresh_process, peak_memory, table, timed, write_result
+from gyromodel._compiling import FUSIONS, LOOPS
 
 STEP, CALLS = 1e-3, 7
 # Steps of an epoch: a history at each step, at 100 Hz, and of 100 epochs in a million steps.
 EVERY = (1, 10, 100, 10_000)
 # By default XLA compiles as one kernel only the smallest loops, and dispatches the operations of others one by one.
-ONE_KERNEL = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000000"
+AS_COMMANDS = f"--{FUSIONS}=false {LOOPS}"
 MUST_NAVIGATION, MUST_SENSITIVITY = 1.5, 1.5
 
 
@@ -148,6 +150,22 @@ def _corrected(parameters, rows):
     return now + jnp.cross(before, now) / 12
 
 
+def _coning() -> float:
+    """Drift (rad/s) of the attitude under coning of 1° at 10 Hz in 4 s, from sampled rates with the correction."""
+    import jax.numpy as jnp
+
+    import gyromodel  # noqa: F401  switches to float64
+    from gyromodel.platform import attitudes, coning, integrals
+
+    angle, phase = np.deg2rad(1.0), 2 * np.pi * 10.0 * STEP * np.arange(4001)
+    # q = exp(A (0, cos, sin)), and ω = 2 q* q̇.
+    tilt = np.full(len(phase), np.cos(angle) - 1)
+    rates = 20 * np.pi * np.stack([tilt, -np.sin(angle) * np.sin(phase), np.sin(angle) * np.cos(phase)], axis=1)
+    q = np.array([np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0])  # at whole turns, as first and last
+    end = attitudes(jnp.asarray(q), coning(integrals(jnp.asarray(rates), STEP)), 4000)[-1]
+    return 2 * float(np.linalg.norm(np.asarray(end) - q)) / (4000 * STEP)
+
+
 def _measure(what: str, steps: int, every: int) -> dict[str, float]:
     """Best of some calls of each, in turns; the first call compiles and is not counted."""
     data = (*_motion(steps), np.array([np.deg2rad(40.0), 0.0, 0.0]), every)
@@ -174,7 +192,7 @@ def main(argv: list[str] | None = None) -> None:
         print(json.dumps(_measure(args.only[0], args.steps, int(args.only[1]))))
         return
     rows = []
-    for what, flags in (("attitude", ""), ("navigation", ""), ("navigation", ONE_KERNEL), ("sensitivity", "")):
+    for what, flags in product(("attitude", "navigation", "sensitivity"), ("", AS_COMMANDS)):
         for every in EVERY if what != "sensitivity" else EVERY[-1:]:
             command = ("--steps", str(args.steps), "--only", what, str(every))
             m = in_fresh_process("benchmarks.navigation_speed", *command, XLA_FLAGS=flags)
@@ -183,7 +201,7 @@ def main(argv: list[str] | None = None) -> None:
                 nanoseconds = m["theirs"] / args.steps * 1e9
                 peer = [f"{nanoseconds:.0f}", f"{m['ours'] / m['theirs']:.2f}", f"{m['apart']:.0e}"]
             name = "sensitivity to 12 parameters" if what == "sensitivity" else what
-            name += ", loops as one kernel" if flags else ""
+            name += ", as commands" if flags else ""
             ours = f"{m['ours'] / args.steps * 1e9:.0f}"
             rows.append([name, f"{every:,}", ours, *peer, f"{m['peak'] / MIB:.0f}"])
     head = [
@@ -199,9 +217,12 @@ def main(argv: list[str] | None = None) -> None:
     lines = [
         f"{args.steps:,} steps of {STEP:g} s; best of {CALLS} calls in turns, one process each row, compilation not "
         "counted. The numba loops hold the same equations in scalars. Of navigation, Earth, gravity and position are "
-        f"taken once an epoch, in both. The aims are {MUST_NAVIGATION:g} times the loop's time for navigation and "
-        f"{MUST_SENSITIVITY:g} s for the sensitivities. With XLA_FLAGS={ONE_KERNEL} in the environment the epochs "
-        f"of navigation cost what their arithmetic does.{found}",
+        f"taken once an epoch, in both. The aims are the loop's time for attitude, {MUST_NAVIGATION:g} times it for "
+        f"navigation, and {MUST_SENSITIVITY:g} s for the sensitivities of a million steps. *As commands* is with "
+        f"XLA_FLAGS={AS_COMMANDS!r}, which commands set; elsewhere it has to be in the environment, as XLA takes it "
+        f"for no single function, and without it each epoch of navigation costs some 2 µs of dispatch.{found}",
+        "",
+        f"Coning of 1° at 10 Hz and {1 / STEP:g} samples a second, corrected: a drift of {_coning():.1e} rad/s.",
         "",
         *table(head, rows),
     ]

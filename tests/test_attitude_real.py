@@ -19,14 +19,14 @@ def rms(values: np.ndarray) -> float:
 
 
 def test_bias_matrix_and_delay_are_worth_their_fit(measured_data: Callable[[str], Path]):
-    name, rest = study.SESSIONS["TStick 04"]
+    name, rest, _ = study.SESSIONS["TStick 04"]
     session = study.read(name, measured_data(f"mems_attitude/{name}.csv.gz").parent)
     time, rates, _ = session
     windows = study.cut(*session, study.LENGTH, study.LENGTH)
     middle = time[len(time) // 2]
     train = study.some(windows, windows.begin + study.LENGTH <= middle)
     test = study.some(windows, windows.begin > middle)
-    found = study.fitted((train,), ("bias", "matrix", "delay"))
+    found = study.corrected(study.fitted((train,)).value)
     still = {**study.start(), "bias": jnp.asarray(-rates[time < time[0] + rest].mean(axis=0))}
     before = rms(study.error(study.start(), test))
     assert 1.6 < before < 3.5

@@ -163,6 +163,54 @@ def test_rest_and_round_the_equator():
     assert np.abs(np.asarray(found.position[:, ::2]) - [0.0, 300.0]).max() < 1e-3
 
 
+def round_a_circle(latitude: float, heading: float, step: float) -> tuple[Navigation, np.ndarray]:
+    """What is at the beginning and after each step, and pushes in inertial axes, 3 km up, the normal going 6e-4 rad/s.
+
+    The pushes are changes of the inertial velocity less gravitation, by Gauss and Legendre's rule of two points.
+    """
+    turn, height, time = 6e-4, 3000.0, np.arange(STEPS + 1) * step
+    _, up, east = truth.axes(latitude, 0.4).T
+    towards = np.cos(heading) * truth.axes(latitude, 0.4)[:, 0] + np.sin(heading) * east
+
+    def at(time: np.ndarray) -> tuple[np.ndarray, ...]:
+        return *truth.along(time, up, towards, turn, height), np.stack([truth.spin(OMEGA * t) for t in time])
+
+    def turned(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+        return np.einsum("kij,kj->ki", matrices, vectors)
+
+    normal, r, v, spin = at(time)
+    pushes = np.diff(turned(spin, v + np.cross([0.0, 0.0, OMEGA], r)), axis=0)
+    for part in (0.5 - 12**-0.5, 0.5 + 12**-0.5):
+        _, between, _, then = at(time[:-1] + part * step)
+        pushes -= 0.5 * step * turned(then, np.stack([truth.gravitation(x) for x in between]))
+    place = np.stack([np.arcsin(normal[:, 2]), np.arctan2(normal[:, 1], normal[:, 0]), 0 * time + height], 1)
+    local = np.stack([truth.axes(*p[:2]) for p in place]).transpose(0, 2, 1)
+    return Navigation(local @ spin.transpose(0, 2, 1), turned(local, v), place), pushes
+
+
+@pytest.mark.parametrize(("latitude", "heading"), [(-20.0, 0.0), (30.0, 1.0)], ids=["meridian", "oblique"])
+def test_along_a_great_circle(latitude: float, heading: float):
+    """Over 70° in 2000 s against its closed form, and errors of second order in the epoch, height free or kept."""
+    step = 0.5
+    true, pushes = round_a_circle(np.deg2rad(latitude), heading, step)
+    start = Navigation(*(jnp.asarray(x[0]) for x in true))._replace(attitude=from_matrix(jnp.asarray(true.attitude[0])))
+
+    def wrong(every: int, level: bool) -> np.ndarray:
+        found = navigate(start, jnp.zeros((STEPS, 3)), jnp.asarray(pushes), step, every, level)
+        ends = (x[every::every] for x in true)
+        matrix, velocity, metres = (np.asarray(x) - y for x, y in zip(_as_matrix(found), ends, strict=True))
+        return np.array([np.abs(x).max() for x in (matrix, velocity, metres * [6.4e6, 6.4e6, 1.0])])
+
+    for level, limits in ((False, [4e-8, 1e-3, 0.5]), (True, [2e-8, 2e-4, 0.2])):
+        fine = wrong(1, level)
+        assert (fine < limits).all(), fine
+        assert wrong(2, level) / fine == pytest.approx(4.0, rel=0.02)
+
+
+def _as_matrix(found: Navigation) -> Navigation:
+    return found._replace(attitude=to_matrix(found.attitude))
+
+
 def test_free_fall():
     """h = −½ g t² (1 + g t²/(6R)), as gravity grows by 2/R, eastward ⅓ Ω g t³ cos L (W. Thomson and Tait), at 10 s."""
     start = Navigation(LEVEL, jnp.zeros(3), jnp.array([0.7, 0.0, 1000.0]))
@@ -273,6 +321,24 @@ def test_the_same_as_an_independent_navigation(independent: tuple[np.ndarray, np
     assert ((order > 1.8) & (order < 2.5)).all(), (rougher, rough)
 
 
+def test_the_same_increments_by_an_independent_strapdown(rng: np.random.Generator):
+    """Increments of no smooth motion: with an epoch of one step all is the same, with longer ones to second order."""
+    step = END / STEPS
+    turns = 1e-2 * rng.standard_normal((STEPS, 3))
+    pushes = step * (10 * rng.standard_normal((STEPS, 3)) + [1.0, 9.8, 0.5])
+    start = TILTED, np.asarray(START.velocity), np.asarray(START.position)
+    expected = truth.strapdown(*start, turns, pushes, step)
+
+    def wrong(every: int) -> np.ndarray:
+        history = navigate(START, jnp.asarray(turns), jnp.asarray(pushes), step, every)
+        return differences(jax.tree.map(lambda x: x[-1], history), expected)
+
+    fine = wrong(1)
+    assert (fine < [1e-12, 3e-8, 3e-6]).all(), fine
+    longer = wrong(EVERY)
+    assert (longer < [1e-6, 1e-4, 3.0]).all(), longer
+
+
 def test_runs_side_by_side(rng: np.random.Generator):
     turns, pushes = 1e-3 * rng.standard_normal((2, 3, STEPS, 3))
     together = jax.vmap(navigate, (None, 0, 0, None, None))(START, turns, pushes, 0.01, EVERY)
@@ -305,6 +371,49 @@ def test_sensitivity_is_the_derivative():
     expected = 2 * np.asarray(product(moved, inverse(plain)))[:, 1:]
     along = np.tensordot(found["bias"], direction["bias"], 1) + np.tensordot(found["matrix"], direction["matrix"], 2)
     assert np.abs(along - expected).max() < 1e-12 * np.abs(expected).max()
+
+
+def last(start: Navigation, turns: jax.Array, pushes: jax.Array, step: jax.Array) -> jax.Array:
+    """All at the end, in units that errors of gyros move alike: arcsec or so, m/s and m."""
+    end = jax.tree.map(lambda x: x[-1], navigate(start, turns, pushes, step, 40))
+    return jnp.concatenate([1e5 * end.attitude, end.velocity, end.position * jnp.array([6.4e6, 6.4e6, 1.0])])
+
+
+@pytest.mark.long
+def test_forward_mode(rng: np.random.Generator):
+    """Along a direction in all that goes in, as by differences and as reverse mode has it."""
+    turns, pushes = (jnp.asarray(x) for x in integrated(END, STEPS))
+    at = START, turns, pushes, jnp.asarray(END / STEPS)
+    units = Navigation(*map(jnp.asarray, (1e-5, 1e-2, [1e-9, 1e-9, 1e-2]))), 1e-8, 1e-6, 1e-8
+    units = jax.tree.map(lambda x, u: jnp.broadcast_to(u, x.shape), at, (units[0], *map(jnp.asarray, units[1:])))
+    along = jax.tree.map(lambda u: u * rng.standard_normal(u.shape), units)
+    forward = jax.jit(lambda x, d: jax.jvp(last, x, d)[1])(at, along)
+
+    shifted = [last(*jax.tree.map(lambda x, d, s=s: x + s * d, at, along)) for s in (10.0, -10.0)]
+    by_differences = np.asarray(shifted[0] - shifted[1]) / 20
+    assert np.asarray(forward) == pytest.approx(by_differences, abs=1e-6 * np.abs(by_differences).max())
+
+    weights = jnp.asarray(rng.standard_normal(10))
+    back = jax.jit(lambda x, w: jax.vjp(last, *x)[1](w))(at, weights)
+    backwards = sum(jax.tree.leaves(jax.tree.map(lambda g, d: jnp.sum(g * d), back, along)))
+    size = float(jnp.abs(weights) @ jnp.abs(forward))
+    assert float(weights @ forward) == pytest.approx(float(backwards), abs=1e-9 * size)
+
+
+@pytest.mark.parametrize("what", ["attitudes", "navigate"])
+def test_reverse_mode_keeps_no_states_of_steps(what: str):
+    """What it takes beside its input grows with the epochs: ten times the steps, less than a number for each."""
+
+    def size(steps: int) -> int:
+        def end(start: Navigation, turns: jax.Array) -> jax.Array:
+            if what == "attitudes":
+                return jnp.sum(attitudes(start.attitude, turns, 100)[-1])
+            return jnp.sum(navigate(start, turns, turns, 1e-3, 100).position[-1])
+
+        compiled = jax.jit(jax.grad(end)).lower(START, jnp.zeros((steps, 3))).compile()
+        return compiled.memory_analysis().temp_size_in_bytes
+
+    assert size(40_000) - size(4_000) < 36_000 * 8
 
 
 def miss(bias: jax.Array, turns: jax.Array, pushes: jax.Array) -> jax.Array:

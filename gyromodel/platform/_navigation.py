@@ -15,6 +15,10 @@ from jaxtyping import Array, Float
 from gyromodel.numerics.rotations import cross, exponential, normalise, product, rotate
 from gyromodel.platform._earth import earth_rate, gravity, radii, transport_rate
 
+# Most steps of attitude in one inner loop, where epochs are shorter. XLA makes that loop one kernel and dispatches the
+# operations around it one by one: an inner loop for each short epoch would cost little else.
+BLOCK = 1024
+
 
 class Navigation(NamedTuple):
     """Attitude, velocity and position of a platform; a history has an axis of epochs in front.
@@ -43,14 +47,20 @@ def attitudes(start: Float[Array, " 4"], rotations: Float[Array, "step 3"], ever
     Raises:
         ValueError: the steps are not a whole number of epochs.
     """
+    epochs = len(in_epochs(rotations, every))
+    together = max(n for n in range(1, max(BLOCK // every, 1) + 1) if epochs % n == 0)
 
-    # In reverse mode each epoch is computed again: what is kept is no longer than the history.
-    @jax.checkpoint
-    def epoch(q, turns):
-        q = normalise(jax.lax.scan(lambda q, turn: (product(q, exponential(turn)), None), q, turns)[0])
+    def advance(q, turn):
+        q = product(q, exponential(turn))
         return q, q
 
-    return jax.lax.scan(epoch, start, in_epochs(rotations, every))[1]
+    # In reverse mode each block is computed again: what is kept is no longer than the history.
+    @jax.checkpoint
+    def block(q, turns):
+        q, history = jax.lax.scan(advance, q, turns)
+        return normalise(q), normalise(history[every - 1 :: every])
+
+    return jax.lax.scan(block, start, in_epochs(rotations, together * every))[1].reshape(-1, 4)
 
 
 @partial(jax.jit, static_argnames=("every", "level"))

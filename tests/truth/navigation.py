@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
 
 A, B = 6378137.0, 6356752.3142
 OMEGA = 7.292115e-5
@@ -60,10 +61,51 @@ def normal_gravity(latitude: float, height: float) -> float:
     return float(surface * (1 - 2 * slope * height / A + 3 * height**2 / A**2))
 
 
-def _gravitation(r: Array) -> Array:
+def gravitation(r: Array) -> Array:
+    """At an Earth-fixed position, in Earth-fixed axes: gravity less its centrifugal part."""
     latitude, longitude, height = geodetic(r)
     down = -axes(latitude, longitude)[:, 1]
     return normal_gravity(latitude, height) * down - OMEGA**2 * np.array([r[0], r[1], 0.0])
+
+
+def along(time: Array, start: Array, towards: Array, turn: float, height: float) -> tuple[Array, Array, Array]:
+    """Upward normal, and Earth-fixed position and velocity, where the normal goes round a great circle.
+
+    Args:
+        time: s.
+        start: normal at time zero.
+        towards: unit vector at right angles to it.
+        turn: rate of the normal, rad/s.
+        height: above the ellipsoid, m.
+    """
+    s, c = np.sin(turn * time)[:, None], np.cos(turn * time)[:, None]
+    n, dn, square = c * start + s * towards, turn * (c * towards - s * start), np.array([A, A, B]) ** 2
+    size = np.sqrt((n * n) @ square)[:, None]
+    velocity = square * (dn / size - n * ((n * dn) @ square)[:, None] / size**3)
+    return n, square * n / size + height * n, velocity + height * dn
+
+
+def strapdown(
+    attitude: Array, velocity: Array, position: Array, rotations: Array, pushes: Array, step: float
+) -> tuple[Array, Array, Array]:
+    """What `navigate` returns, from increments: turns by matrices, velocity by half kicks of gravitation (Verlet).
+
+    Args:
+        attitude, velocity, position: as of `navigate`.
+        rotations: rotation vector of each step in the axes of the body.
+        pushes: integral of the specific force over each step in the axes of the body at its start.
+        step: s.
+    """
+    local, r = axes(*position[:2]), cartesian(*position)
+    v, matrix = local @ velocity + np.cross([0.0, 0.0, OMEGA], r), local @ attitude
+    kick = 0.5 * step * gravitation(r)
+    for k, (turn, push) in enumerate(zip(Rotation.from_rotvec(rotations).as_matrix(), pushes, strict=True), 1):
+        pushed = matrix @ push
+        r = r + step * (v + kick + 0.5 * pushed)
+        earth = spin(OMEGA * k * step)
+        before, kick = kick, 0.5 * step * earth @ gravitation(earth.T @ r)
+        v, matrix = v + before + pushed + kick, matrix @ turn
+    return _on_earth(OMEGA * step * len(pushes), r, v, matrix)
 
 
 def navigate(
@@ -86,14 +128,19 @@ def navigate(
 
     def slope(t: float, y: Array) -> Array:
         matrix, earth, (p, q, s) = y[6:].reshape(3, 3), spin(OMEGA * t), rate(t)
-        acceleration = matrix @ force(t) + earth @ _gravitation(earth.T @ y[:3])
+        acceleration = matrix @ force(t) + earth @ gravitation(earth.T @ y[:3])
         turn = matrix @ np.array([[0.0, -s, q], [s, 0.0, -p], [-q, p, 0.0]])
         return np.concatenate([y[3:6], acceleration, turn.ravel()])
 
     y = solve_ivp(slope, (0.0, end), start, method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
-    earth = spin(OMEGA * end)
-    r = earth.T @ y[:3]
+    return _on_earth(OMEGA * end, y[:3], y[3:6], y[6:].reshape(3, 3))
+
+
+def _on_earth(angle: float, r: Array, v: Array, matrix: Array) -> tuple[Array, Array, Array]:
+    """Attitude to north-up-east, velocity over the Earth and position of what is inertial, the Earth turned so far."""
+    earth = spin(angle)
+    r = earth.T @ r
     position = geodetic(r)
     local = axes(*position[:2])
-    velocity = local.T @ (earth.T @ y[3:6] - np.cross(turning, r))
-    return local.T @ earth.T @ y[6:].reshape(3, 3), velocity, position
+    velocity = local.T @ (earth.T @ v - np.cross([0.0, 0.0, OMEGA], r))
+    return local.T @ earth.T @ matrix, velocity, position
