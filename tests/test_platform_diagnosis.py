@@ -159,7 +159,9 @@ def test_a_delay_and_friction_about_one_axis(axis: str, seed: int):
     diagnosis = found(log.select(np.isin(log.columns["segment"], "XYZ".index(axis) + np.array([1, 4, 7, 10]))))
     # One draw in ten has a resonance beside them, in doubt.
     assert {cause.effect for cause in diagnosis.causes} >= {"sync_delay", "shaft_friction"}
-    assert values(diagnosis)["sync_delay.delay"][0] == pytest.approx(2.0, abs=0.3)
+    # A few draws leave open how much of the delay is friction, with an interval as wide as that.
+    delay, std = values(diagnosis)["sync_delay.delay"]
+    assert abs(delay - 2.0) < 0.1 + 4 * std
 
 
 def test_units_do_not_matter(seed: int):
