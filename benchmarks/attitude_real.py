@@ -72,7 +72,7 @@ def unknown(names: tuple[str, ...] = tuple(BEFOREHAND)) -> Parameters:
 
 
 def corrected(fitted: Parameters) -> Parameters:
-    """Bias, matrix and delay: the matrix of scale factors and leans (xy, yz, zx) of the unit, turned by its mounting."""
+    """Bias, matrix and delay: the matrix of scale factors and leans (xy, yz, zx), turned by the mounting."""
     found = {**unknown(), **fitted}
     xy, yz, zx = found["lean"]
     unit = jnp.eye(3) + jnp.diag(found["scale"]) + jnp.array([[0.0, xy, zx], [xy, 0.0, yz], [zx, yz, 0.0]])

@@ -4,13 +4,12 @@ whole chain on it: navigation and gimbal angles give back the motion of the base
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gyromodel.platform import Axis, GimbalErrors, Navigation, base_angles, navigate, simulate_axis
+from gyromodel.platform import GimbalErrors, Navigation, base_angles, navigate
 from tests.truth import navigation, platform
 from tests.truth.platform import AXES, Loop, Platform
 
@@ -191,47 +190,3 @@ def test_the_chain_gives_back_the_motion_of_the_base(rng: np.random.Generator):
             np.abs(run.table[0, 1:] - level - amplitude * np.sin(frequency * run.time[1:, None])).max() < QUANTUM / 1.9
         )
     assert np.abs(chain(design, run, exact) - true).max() > 10 * QUANTUM
-
-
-def one_axis(design: Platform, axis: int, gimbal: int) -> Axis:
-    torque = Loop().torque(design.carried()[axis])
-    numerator = np.pad(torque.num, (len(torque.den) - len(torque.num), 0))
-    friction = design.viscous[gimbal], design.coulomb[gimbal]
-    return Axis(design.carried()[axis], *friction, jnp.asarray(numerator), jnp.asarray(torque.den))
-
-
-def test_one_axis_is_the_same_in_the_package():
-    """Roll and pitch of the rigid bodies with drift and with friction that sticks: to 0.2 %."""
-    drift = np.array([2e-5, 0.0, -3e-5])
-    design = FREE._replace(
-        loop=Loop(), viscous=np.array([0.0, 1.0, 0.0, 2.0]), coulomb=np.array([0.0, 0.1, 0.0, 0.05]),
-        drift=lambda t: np.outer(1 + t, drift),
-    )  # fmt: skip
-    amplitude, frequency = np.deg2rad([[0.15, 0.0, 0.3]]), np.array([[30.0, 10.0, 20.0]])
-    run = platform.simulate(design, amplitude, frequency, 1.0)
-    found = turned(run.platform[0])
-    moved = amplitude[0] * np.sin(frequency[0] * run.time[:, None])
-    for axis, gimbal, base in ((2, 3, moved[:, 0]), (0, 1, -moved[:, 2])):
-        error = jnp.asarray((1 + run.time) * drift[axis])
-        args = jnp.asarray(base), error, design.step
-        simulated = one_axis(design, axis, gimbal)
-        expected = np.asarray(simulate_axis(simulated, *args))
-        assert np.abs(found[:, axis] - expected).max() < 2e-3 * np.abs(expected).max()
-        without = np.asarray(simulate_axis(simulated._replace(coulomb=0.0), *args))
-        assert np.abs(expected - without).max() > 0.02 * np.abs(expected).max()
-
-
-def size(friction: jax.Array, axis: Axis, base: jax.Array) -> jax.Array:
-    moved = simulate_axis(axis._replace(viscous=friction[0], coulomb=friction[1]), base, 0 * base, Platform().step)
-    return jnp.sum(moved**2)
-
-
-def test_one_axis_is_differentiable():
-    """Against differences, sliding; a friction that nothing overcomes carries the body along."""
-    base, axis = 5e-3 * jnp.sin(30 * jnp.arange(2000) * 5e-4), one_axis(Platform(), 2, 3)
-    friction = jnp.array([1.0, 0.01])
-    back = jax.jit(jax.grad(size))(friction, axis, base)
-    shifted = [float(size(friction * (1 + s), axis, base)) for s in (1e-4, -1e-4)]
-    assert float(back @ friction) == pytest.approx((shifted[0] - shifted[1]) / 2e-4, rel=1e-4)
-    stuck = simulate_axis(axis._replace(coulomb=1e6), base, 0 * base, 5e-4)
-    assert np.allclose(stuck, base, atol=1e-15)

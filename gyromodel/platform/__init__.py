@@ -11,6 +11,7 @@ from gyromodel.platform._acceptance import (
     limits_at,
 )
 from gyromodel.platform._assessment import EXCLUDED, VibrationTest, parameters, vibration_test
+from gyromodel.platform._bench import Bench, base_on_table, simulate_vibration_test
 from gyromodel.platform._campaign import navigate_campaign
 from gyromodel.platform._drift import residual_drift
 from gyromodel.platform._earth import EARTH_RATE, earth_rate, gravity, radii, transport_rate
@@ -43,7 +44,7 @@ from gyromodel.platform._record import VibrationRecord, fit_vibration, vibration
 from gyromodel.platform._responses import Response, responses
 from gyromodel.platform._sensitivity import attitude_sensitivity
 from gyromodel.platform._series import fit_series
-from gyromodel.platform._simulation import Axis, simulate_axis
+from gyromodel.platform._simulation import Platform, PlatformMotion, simulate_platform
 from gyromodel.platform._vibration import PublishedResponse, SineFit, fit_sines, published_response
 
 __all__ = [
@@ -58,8 +59,8 @@ __all__ = [
     "PRINTED_PHASE",
     "TABLE",
     "Alternative",
-    "Axis",
     "BaseMotion",
+    "Bench",
     "Errors",
     "Explanation",
     "GimbalErrors",
@@ -68,6 +69,8 @@ __all__ = [
     "Mount",
     "Navigation",
     "NavigationError",
+    "Platform",
+    "PlatformMotion",
     "Points",
     "PublishedResponse",
     "Response",
@@ -79,6 +82,7 @@ __all__ = [
     "attitudes",
     "base_angles",
     "base_motion",
+    "base_on_table",
     "coning",
     "drift_errors",
     "earth_rate",
@@ -112,7 +116,8 @@ __all__ = [
     "responses",
     "sculling",
     "separation",
-    "simulate_axis",
+    "simulate_platform",
+    "simulate_vibration_test",
     "transport_rate",
     "vibration_record",
     "vibration_test",

@@ -57,12 +57,18 @@ def gimbal_attitude(angles: Gimbals, errors: GimbalErrors | None = None) -> Quat
     Returns:
         Quaternion that turns vectors from platform to base axes.
     """
-    axes = jnp.asarray(AXES)
     if errors is not None:
-        angles = angles - _harmonics(angles, errors.encoder_harmonic)
-        axes = axes + jnp.einsum("gt,gtv->gv", errors.nonorthogonality, SQUARE)
-        axes = axes / jnp.linalg.norm(axes, axis=1, keepdims=True)
-    return _chain(angles, axes)
+        angles = angles - harmonics(angles, errors.encoder_harmonic)
+    return chain(angles, gimbal_axes(errors))
+
+
+def gimbal_axes(errors: GimbalErrors | None) -> Float[Array, "4 3"]:
+    """Axis of each gimbal in the frame that it is carried by, outermost first; the nominal ones without errors."""
+    axes = jnp.asarray(AXES)
+    if errors is None:
+        return axes
+    axes = axes + jnp.einsum("gt,gtv->gv", errors.nonorthogonality, SQUARE)
+    return axes / jnp.linalg.norm(axes, axis=1, keepdims=True)
 
 
 @jax.jit
@@ -106,11 +112,11 @@ def least_motion_gimbals(
 
     def epoch(before, target):
         def improve(_, now):
-            jacobian, missing = _axes_in_base(now), logarithm(product(target, inverse(_chain(now, axes))))
+            jacobian, missing = _axes_in_base(now), logarithm(product(target, inverse(chain(now, axes))))
             return before + jacobian.T @ _solve(jacobian @ jacobian.T, missing - jacobian @ (before - now))
 
         now = jax.lax.fori_loop(0, STEPS, improve, before)
-        missing = logarithm(product(target, inverse(_chain(now, axes))))
+        missing = logarithm(product(target, inverse(chain(now, axes))))
         now = jnp.where(jnp.max(jnp.abs(missing)) < MISS, now, jnp.nan)
         return now, now
 
@@ -124,7 +130,7 @@ def euler_attitude(angles: Euler) -> Quaternion:
     Args:
         angles: azimuth ψ, pitch θ and roll γ, rad.
     """
-    return _chain(angles, jnp.asarray(AXES)[jnp.array([0, 1, 3])])
+    return chain(angles, jnp.asarray(AXES)[jnp.array([0, 1, 3])])
 
 
 @jax.jit
@@ -175,7 +181,7 @@ def base_angles(
     return jnp.stack([roll, azimuth, pitch], axis=-1) @ mounting.T
 
 
-def _chain(angles: jax.Array, axes: jax.Array) -> jax.Array:
+def chain(angles: jax.Array, axes: jax.Array) -> jax.Array:
     """Rotations by angles, each about its axis in the frame that those before have turned."""
     halves = 0.5 * angles[..., None]
     turns = jnp.concatenate([jnp.cos(halves), jnp.sin(halves) * axes], axis=-1)
@@ -185,7 +191,7 @@ def _chain(angles: jax.Array, axes: jax.Array) -> jax.Array:
 def _axes_in_base(angles: jax.Array) -> jax.Array:
     """Where the gimbals before have put the axis of each: columns."""
     axes = jnp.asarray(AXES)
-    return jnp.stack([axes[0], *(rotate(_chain(angles[:k], axes[:k]), axes[k]) for k in (1, 2, 3))], axis=1)
+    return jnp.stack([axes[0], *(rotate(chain(angles[:k], axes[:k]), axes[k]) for k in (1, 2, 3))], axis=1)
 
 
 def _solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
@@ -195,7 +201,7 @@ def _solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
     return rows @ right / (a @ rows[0])
 
 
-def _harmonics(angles: jax.Array, harmonics: jax.Array) -> jax.Array:
+def harmonics(angles: jax.Array, harmonics: jax.Array) -> jax.Array:
     """Error Σ (c_k cos kr + s_k sin kr) of each encoder."""
     turns = angles[..., None] * jnp.arange(1.0, harmonics.shape[1] + 1)
     return jnp.sum(harmonics[..., 0] * jnp.cos(turns) + harmonics[..., 1] * jnp.sin(turns), axis=-1)

@@ -22,7 +22,7 @@ from scipy.optimize import brentq
 # Where margins are looked for, rad/s, and at how many frequencies.
 LOWEST, HIGHEST, SEARCHED = 1e-1, 1e5, 6000
 
-Scalar = Float[Array, ""]
+Scalar = Float[Array, ""] | float
 Response = Complex[Array, " frequency"]
 
 
