@@ -8,20 +8,24 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from importlib.resources import files
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
+from scipy.stats import kstest
 
 import gyromodel
 from gyromodel import CampaignError, cli
 from gyromodel.campaign import Campaign
 from gyromodel.declarations import declarations
 from gyromodel.diagnosis import Diagnosis
+from gyromodel.diagnosis._misfit import axis_probabilities, unexplained_axes
 from gyromodel.effects import CATALOGUE
 from gyromodel.effects._base import evaluate
 from gyromodel.effects.platform import ENCODERS, SHAFTS, TILTS, EncoderHarmonic, ShaftFriction
+from gyromodel.estimate import fit_record
 from gyromodel.files import read_campaign
 from gyromodel.model import GyroModel, ModelError, make_effect, model_from_effects
 from gyromodel.model_files import read_model, write_model
@@ -110,6 +114,28 @@ def test_friction_that_sticks_has_no_other_name(seed: int):
     """What the redundant gimbal sticks by follows the motion as tilts, encoders and delays do."""
     diagnosis = found(sticking(seed))
     assert (diagnosis.verdict, [c.effect for c in diagnosis.causes]) == ("named", ["shaft_friction"])
+
+
+def test_an_axis_that_nothing_explains_moves_no_value():
+    """In the embedded log the redundant gimbal sticks: with the runs about Y the delay is 2.0089 ± 0.0014 ms, not 2."""
+    log = read_campaign(files("gyromodel") / "data" / "platform_vibration.csv.gz")
+    diagnosis = found(log)
+    assert {cause.effect for cause in diagnosis.causes} == {"sync_delay", "shaft_friction"}
+    assert any(line.startswith("Runs about Y were left out") for line in diagnosis.findings)
+    delay, std = values(diagnosis)["sync_delay.delay"]
+    assert abs(delay - 2.0) < 3 * std < 0.05
+    everything = fit_record(vibration_record(log).record, diagnosis.extended.model_as_given())
+    assert unexplained_axes(everything) == ["Y"]
+    assert not unexplained_axes(diagnosis.extended)
+
+
+def test_probabilities_of_axes_are_uniform_where_all_is_explained(seed: int):
+    found = [axis_probabilities(fit_vibration(vibration(seed=seed + k), NOTHING)) for k in range(20)]
+    values = np.array([list(of.values()) for of in found]).ravel()
+    assert len(values) == 60
+    assert kstest(values, "uniform").pvalue > 1e-4
+    late = fit_vibration(vibration("sync_delay", 0.03 * MS, seed), NOTHING)
+    assert unexplained_axes(late)
 
 
 def test_steps_of_encoders_are_no_friction():

@@ -46,11 +46,11 @@ class Data:
     step: float = 0.0
 
 
-def read(measured: Sequence[Campaign]) -> Data:
-    """Campaigns of one gyro, or logs of one platform, as they are searched."""
+def read(measured: Sequence[Campaign], without: str = "") -> Data:
+    """Campaigns of one gyro, or logs of one platform without runs about some axis, as they are searched."""
     of_platform = [is_platform(c) for c in measured]
     if all(of_platform):
-        test = vibration_record(measured)
+        test = vibration_record(measured, without)
         rows_of = ((test.campaign, False),)
         return Data(test.record, (), rows_of, test.campaign, test.findings, "deg", "deg", test.step)
     if any(of_platform):

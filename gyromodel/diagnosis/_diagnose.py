@@ -9,13 +9,15 @@ from typing import Literal
 
 import numpy as np
 
+from gyromodel._checks import CampaignError, listed
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores
-from gyromodel.diagnosis._data import read
+from gyromodel.diagnosis._data import Data, read
 from gyromodel.diagnosis._evidence import SAFE_THRESHOLD
 from gyromodel.diagnosis._gain import ladder_error, nested_gain, no_gain, not_measured
 from gyromodel.diagnosis._isolation import settling_test
+from gyromodel.diagnosis._misfit import unexplained_axes
 from gyromodel.diagnosis._noise_causes import as_cause, quantisation, telegraph
 from gyromodel.diagnosis._points import dwells_apart
 from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, cells_of_weight, ease, is_driver, is_noise, noise_kinds
@@ -145,6 +147,17 @@ def diagnose(
         else:
             ratio = ParameterValue("ratio", grows.ratio, grows.ratio_std, "1")
             beyond.append(as_cause("noise_heteroscedastic", grows.evidence, ratio))
+    if record.domain == "platform" and selection.found and (failed := unexplained_axes(selection.estimate)):
+        moves = f"the base moves about {listed(failed)} as nothing in the catalogue makes it"
+        others = _without_axis(measured, failed[0], model, session.threshold, say)
+        if others is None:
+            findings.append(f"Values may be wrong by more than their uncertainties: {moves}.")
+        else:
+            data, record, baseline, session, selection = others
+            findings.append(
+                f"Runs about {failed[0]} were left out: with them {moves}, without them all is explained. A shaft that "
+                "sticks makes such an axis."
+            )
     free = _with_noise_estimated(selection.estimate)
     hops = telegraph(baseline, free, unit) if free and record.domain == "gyro" and _like_hops(selection, free) else None
     if hops is not None:
@@ -233,6 +246,24 @@ def _finished(estimate: Estimate, ordinary: bool) -> Estimate:
         with contextlib.suppress(EstimateError):
             estimate = fit_record(estimate.record, estimate.model_as_given(), ordinary=True)
     return with_noise_intervals(estimate)
+
+
+def _without_axis(
+    measured: Sequence[Campaign], axis: str, model: GyroModel, threshold: float, say: Progress
+) -> tuple[Data, Record, Estimate, _Session, Selection] | None:
+    """The search of the runs about other axes, if there are any and what it finds explains them."""
+    try:
+        data = read(measured, without=axis)
+        record, _ = with_columns_known(data.record)
+        baseline = fit_record(record, model)
+    except (CampaignError, EstimateError):
+        return None
+    grid = _grid(record, baseline)
+    scanner = Scanner(record, build_bank(record), grid, stated=baseline.noise_given, step=data.step)
+    session = _Session(scanner, threshold)
+    selection = session.run(baseline, say)
+    explained = selection.found and not unexplained_axes(selection.estimate)
+    return (data, record, baseline, session, selection) if explained else None
 
 
 def _grid(record: Record, baseline: Estimate) -> NoiseGrid:

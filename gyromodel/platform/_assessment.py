@@ -53,12 +53,13 @@ class VibrationTest:
         integrated: whether navigation integrated the rates of the platform.
         explanations: every alternative that the test determines, best first.
         scatter_stated: whether explanations were judged by the responses' own standard errors; where these exclude
-            every one, the scatter is what each of them leaves.
+            every one, whichever axis is left out, the scatter is what each of them leaves of all axes.
+        left_out: the axis without which they do not: friction that sticks makes one such.
         supported: explanations that are not excluded and not far behind, best first.
         further: of further tests of all axes, the least separation of any two of the first supported ones, in standard
             deviations.
         series: the first supported one fitted to the angles themselves, overtones included, where they determine it.
-        sticking: axes that this fit leaves out, as overtones exclude it with them: those of friction that sticks, say.
+        sticking: axes that this fit leaves out, as overtones exclude it with them, the one left out before included.
     """
 
     responses: tuple[Response, ...]
@@ -66,6 +67,7 @@ class VibrationTest:
     integrated: bool
     explanations: dict[str, Explanation] = field(repr=False)
     scatter_stated: bool
+    left_out: tuple[str, ...]
     supported: tuple[str, ...]
     further: dict[str, float]
     series: Explanation | None = field(default=None, repr=False)
@@ -100,6 +102,7 @@ class VibrationTest:
                 for name, e in self.explanations.items()
             ],
             "scatter_stated": self.scatter_stated,
+            "axes_left_out": list(self.left_out),
             "supported": list(self.supported),
             "further_tests": self.further,
             "next_test": self.next_test,
@@ -164,15 +167,9 @@ def vibration_test(campaign: Campaign, progress: Callable[[str, float], None] | 
     found, remarks = responses(motion)
     if not found:
         raise CampaignError(f"{campaign.name}: no run has a vibration: {listed(remarks)}")
-    integrated = float(any(name.startswith("output_") for name in campaign.columns))
-    axis = np.array([AXES.index(r.axis) for r in found])
-    frequency, amplitude = (np.array([getattr(r, name) for r in found]) for name in ("frequency", "amplitude"))
-    ones = np.ones(len(found))
-    at = Points(axis, frequency, ones, integrated * ones, np.deg2rad(amplitude))
+    integrated = any(name.startswith("output_") for name in campaign.columns)
     tell("explaining", 0.3)
-    stated = _explained(at, found, known=True)
-    scatter_stated = any(e.probability >= EXCLUDED for e in stated.values())
-    explanations = stated if scatter_stated else _explained(at, found, known=False)
+    explanations, scatter_stated, left_out = _judged(found, integrated)
     order = sorted(explanations, key=lambda name: explanations[name].criterion)
     explanations = {name: explanations[name] for name in order}
     supported = tuple(
@@ -182,12 +179,37 @@ def vibration_test(campaign: Campaign, progress: Callable[[str, float], None] | 
         and not (scatter_stated and e.probability < EXCLUDED)
     )
     tell("fitting the series", 0.6)
-    series, sticking = _of_series(motion, found, supported, integrated > 0)
+    used = [r for r in found if r.axis not in left_out]
+    series, sticking = _of_series(motion, used, supported, integrated)
     tell("looking for further tests", 0.8)
-    further = _further({name: explanations[name] for name in supported[:RIVALS]}, at, integrated)
+    further = _further({name: explanations[name] for name in supported[:RIVALS]}, _at(found, integrated), integrated)
     return VibrationTest(
-        tuple(found), tuple(remarks), integrated > 0, explanations, scatter_stated, supported, further, series, sticking
-    )
+        tuple(found), tuple(remarks), integrated, explanations, scatter_stated, left_out, supported, further, series,
+        left_out + sticking,
+    )  # fmt: skip
+
+
+def _judged(found: list[Response], integrated: bool) -> tuple[dict[str, Explanation], bool, tuple[str, ...]]:
+    """Explanations, whether they were judged by stated errors, and the axis left out as these exclude all with it."""
+    axes = sorted({r.axis for r in found})
+    best: tuple[float, dict[str, Explanation], tuple[str, ...]] = 0.0, {}, ()
+    for left_out in ((), *((axis,) for axis in axes if len(axes) > 1)):
+        used = [r for r in found if r.axis not in left_out]
+        stated = _explained(_at(used, integrated), used, known=True)
+        probability = max((e.probability for e in stated.values()), default=0.0)
+        if probability >= max(EXCLUDED, best[0]):
+            best = probability, stated, left_out
+        if not left_out and best[1]:
+            break
+    _, stated, left_out = best
+    return (stated, True, left_out) if stated else (_explained(_at(found, integrated), found, known=False), False, ())
+
+
+def _at(found: list[Response], integrated: bool) -> Points:
+    axis = np.array([AXES.index(r.axis) for r in found])
+    frequency, amplitude = (np.array([getattr(r, name) for r in found]) for name in ("frequency", "amplitude"))
+    ones = np.ones(len(found))
+    return Points(axis, frequency, ones, integrated * ones, np.deg2rad(amplitude))
 
 
 def _of_series(
@@ -229,12 +251,12 @@ def _held(found: Explanation) -> bool:
     return float(found.value[FRICTION].max()) < float(loop.amplifier * loop.correction * loop.motor)
 
 
-def _further(rivals: dict[str, Explanation], at: Points, integrated: float) -> dict[str, float]:
+def _further(rivals: dict[str, Explanation], at: Points, integrated: bool) -> dict[str, float]:
     if len(rivals) < 2:
         return {}
     tests = {"the same again": at}
     tests |= {
-        f"{w:g} rad/s": points(np.array([w]), 1.0, integrated, float(at.amplitude.mean()))
+        f"{w:g} rad/s": points(np.array([w]), 1.0, float(integrated), float(at.amplitude.mean()))
         for w in FURTHER
         if w > at.frequency.max()
     }

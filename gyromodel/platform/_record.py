@@ -74,12 +74,13 @@ def fit_vibration(campaigns: Campaign | Sequence[Campaign], model: GyroModel) ->
     return with_noise_intervals(fit_record(vibration_record(campaigns).record, model))
 
 
-def vibration_record(campaigns: Campaign | Sequence[Campaign]) -> VibrationRecord:
+def vibration_record(campaigns: Campaign | Sequence[Campaign], without: str = "") -> VibrationRecord:
     """Read logs of vibration tests of one platform.
 
     Args:
         campaigns: as `base_motion` takes them; in every run each axis of the table stands still or oscillates at one
             frequency. Runs that do otherwise are left out.
+        without: axes X, Y, Z about which runs that oscillate are left out too.
 
     Raises:
         CampaignError: something is missing or unusable, or no run is left.
@@ -99,7 +100,7 @@ def vibration_record(campaigns: Campaign | Sequence[Campaign]) -> VibrationRecor
             run = _run(motion, smooth.gimbals[rows], rows, changes, step)
             if isinstance(run, str):
                 findings.append(f"{name} was left out: {run}.")
-            else:
+            elif not any(w for axis, (_, w) in zip("XYZ", run.waves, strict=True) if axis in without):
                 runs.append(run)
     if not runs:
         raise CampaignError(f"{campaigns[0].name}: no run can be used. {' '.join(findings)}")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from gyromodel._checks import listed
 from gyromodel.platform import EXCLUDED, Points, assumed_loop, margins, parameters, predicted
 from gyromodel.report import _drawing as draw
 from gyromodel.report._numbers import with_uncertainty
@@ -65,13 +66,21 @@ def _lines(test: VibrationTest) -> list[str]:
         return [*lines, "", "The runs are too few to explain them together."]
     judged = "the standard errors above" if test.scatter_stated else "the scatter each leaves"
     excluded = "" if test.scatter_stated else " (the standard errors above exclude every explanation offered here)"
-    lines += ["", f"What explains all runs, judged by {judged}{excluded}:"]
+    lines.append("")
+    if test.left_out:
+        lines.append(
+            f"Axis {test.left_out[0]} is left out below: with it the standard errors above exclude every explanation "
+            "offered here, without it they do not. A shaft that sticks makes such an axis."
+        )
+    runs = "the other runs" if test.left_out else "all runs"
+    lines.append(f"What explains {runs}, judged by {judged}{excluded}:")
     for name in test.supported:
         lines.append(f"- {name}: {_values(test.explanations[name])}.")
     rest = len(test.explanations) - len(test.supported)
     lines.append(f"{rest} others are {'excluded or ' if test.scatter_stated else ''}far less likely (vibration.json).")
     if test.series is not None:
-        without = f", without axis {test.sticking[0]}, where something sticks," if test.sticking else ""
+        axes = listed([axis for axis in test.sticking if axis not in test.left_out])
+        without = f", without axis {axes}, where something sticks," if axes else ""
         if test.series.probability < EXCLUDED:
             lines.append("Overtones in the angles exclude the first of these: something sticks, or is not of one size.")
         else:
