@@ -7,14 +7,18 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import binom
 
 import gyromodel as gm
 from gyromodel.averages import average
 from gyromodel.diagnosis._isolation import settling_test
 from gyromodel.diagnosis._points import dwells_apart
+from gyromodel.diagnosis._steps import _quality
 from gyromodel.effects.drivers import BiasColumn, BiasPeriodic, BiasStep
+from gyromodel.estimate import fit_record
 from gyromodel.model import ModelError
 from gyromodel.model_files import read_model, write_model
+from gyromodel.noise import NoiseRatios
 from gyromodel.signals import rate_output, read_signals
 
 ROWS = 240
@@ -315,3 +319,45 @@ def test_sizes_are_told_of_the_parameter_that_has_a_value():
     found = gm.diagnose(campaign(noise, azimuth=azimuth), gm.model_from_effects(["bias"]), hold_out=False)
     magnetic, tilt = (found.minimum_detectable[name] for name in ("bias_magnetic", "table_tilt"))
     assert magnetic == (pytest.approx(tilt[0], rel=0.5), "deg/h")
+
+
+def test_fits_of_more_parameters_pay_for_each():
+    """Ordinary least squares in white noise: −½ n ln RSS − ½ p ln n, up to one constant."""
+    rng = np.random.default_rng(1)
+    temperature = 25 + 30 * np.sin(2 * np.pi * np.arange(ROWS) / 150)
+    measured = campaign(5 + 0.1 * temperature + rng.standard_normal(ROWS), temperature=temperature)
+    columns = [np.ones(ROWS), temperature, temperature**2, temperature**3]
+    quality, expected = [], []
+    for p, effects in ((1, ["bias"]), (2, ["bias", "bias_temperature"]), (3, ["bias", "bias_temperature_curve"])):
+        record = read_signals([measured])
+        quality.append(_quality(fit_record(record, gm.model_from_effects(effects), ratios=NoiseRatios(0.0, 0.0))))
+        design = np.stack(columns[:p], axis=1)
+        rss = np.linalg.lstsq(design, np.asarray(measured.columns["output"]), rcond=None)[1][0]
+        expected.append(-0.5 * ROWS * np.log(rss) - 0.5 * p * np.log(ROWS))
+    assert np.diff(quality) == pytest.approx(np.diff(expected), abs=1e-6)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("curve", [0.0, 8.0])
+def test_a_strong_line_is_no_curve(curve: float):
+    """A scale factor on a line over temperature, 200 standard deviations of it, and a curve of none or eight of its own.
+
+    With each parameter of a fit for nothing a line of noise's own curve was a curve in two of twelve. By the binomial
+    law, where one in twenty is in doubt and one in fifty wrong.
+    """
+    time = np.arange(900.0)
+    warmth = np.sin(3 * np.pi * time / 900)
+    rate = np.where((time // 90) % 2 == 0, 50.0, -50.0)
+    bend = rate * (warmth**2 - np.mean(warmth**2))
+    bend = curve * 1e-3 * bend / np.linalg.norm(bend)
+    wrong, draws, name = 0, 12, "scale_temperature_curve" if curve else "scale_temperature"
+    for seed in range(draws):
+        noise = 1e-3 * np.random.default_rng(seed).standard_normal(900)
+        columns = {"time": time, "rate": rate, "temperature": 25 + 30 * warmth}
+        columns["output"] = rate * (1 + 2e-4 * warmth) + bend + 0.01 + noise
+        units = {"time": "s", "rate": "deg/s", "temperature": "degC", "output": "deg/s"}
+        measured = gm.Campaign(columns, units, {"kind": "rate"})
+        found = gm.diagnose(measured, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
+        wrong += found.verdict == "named" and found.causes[0].effect != name
+        assert name in found.credible_set
+    assert wrong <= binom.ppf(1 - 1e-4, draws, 0.02)

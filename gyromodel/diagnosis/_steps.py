@@ -157,9 +157,10 @@ def standing(path: Sequence[Found]) -> list[Found]:
 
 def _quality(estimate: Estimate) -> float:
     """ln likelihood of a fit, less what its parameters cost (Schwarz): by it fits of different parameters compare."""
-    p = len(estimate.covariance)
-    volume = np.linalg.slogdet(estimate.covariance)[1]
-    return estimate.log_likelihood - 0.5 * (volume + p * np.log(estimate.degrees_of_freedom + p))
+    p, nu = len(estimate.covariance), estimate.degrees_of_freedom
+    # From the restricted likelihood to the profiled one, −½ ln |V| − ½ n ln RSS; and its price.
+    volume = np.linalg.slogdet(estimate.covariance)[1] + p * np.log(nu)
+    return estimate.log_likelihood - 0.5 * (volume + p * np.log(nu + p))
 
 
 def rows_of(found: Sequence[Found]) -> tuple[int, ...]:

@@ -79,12 +79,13 @@ def credible(
         chosen[k] = weight[k] / total
         if sum(chosen.values()) >= CREDIBLE:
             break
+    # A special case that does as well is enough. Where what was found contains it and does better, but not surely, both
+    # stand: whether there is more than the special case is then not known.
     for k in list(chosen):
-        general = [m for m in chosen if m != k and k in _supersedes(m)]
+        general = next((m for m in chosen if m not in (k, name) and k in _supersedes(m)), None)
         if general and k in chosen:
-            loser = min((k, general[0]), key=lambda n: (n == name, chosen[n]))
-            winner = general[0] if loser == k else k
-            chosen[winner] += chosen.pop(loser)
+            loser = min((k, general), key=lambda n: (n == name, chosen[n]))
+            chosen[general if loser == k else k] += chosen.pop(loser)
     # What was added and is not among the likeliest is in doubt with them.
     return chosen if name in chosen else chosen | {name: weight[name] / total}
 
