@@ -340,7 +340,7 @@ def test_fits_of_more_parameters_pay_for_each():
 @pytest.mark.long
 @pytest.mark.parametrize("curve", [0.0, 8.0])
 def test_a_strong_line_is_no_curve(curve: float):
-    """A scale factor on a line over temperature, 200 standard deviations of it, and a curve of none or eight of its own.
+    """A scale factor on a line over temperature, 200 standard deviations of it, and a curve of none or of eight.
 
     With each parameter of a fit for nothing a line of noise's own curve was a curve in two of twelve. By the binomial
     law, where one in twenty is in doubt and one in fifty wrong.
