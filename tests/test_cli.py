@@ -152,7 +152,7 @@ def test_ctrl_c_ends_in_one_sentence_from_the_first_import_on(tmp_path: Path, lo
     assert re.fullmatch("gyromodel: interrupted; .*\n", done.stderr)
 
 
-def test_ctrl_c_after_the_last_line_is_too_late(tmp_path: Path):
+def test_ctrl_c_after_the_last_line_is_too_late():
     ending = "import atexit, signal; from gyromodel.__main__ import main\n"
     ending += "atexit.register(signal.raise_signal, signal.SIGINT); main()"
     command = [sys.executable, "-c", ending, "effects", "bias", "--json"]
