@@ -29,8 +29,8 @@ def refuse_navigated(campaigns: Iterable[Campaign]) -> None:
     for campaign in campaigns:
         if "navigated" in campaign.metadata:
             raise CampaignError(
-                f"{campaign.name}: its attitude, velocity and position were computed from its outputs, and tell nothing "
-                "of the gyro: take the log that was navigated"
+                f"{campaign.name}: its attitude, velocity and position were computed from its outputs, and tell "
+                "nothing of the gyro: take the log that was navigated"
             )
 
 

@@ -63,8 +63,8 @@ class Parameter(NamedTuple):
     """One parameter over an archive.
 
     parameter, axis, unit: as in the results; mean, mean_std: μ; between, within: τ and κ, NaN where only one unit, or
-    no unit twice, was measured; units, campaigns: how many; outliers, drifts: those beyond chance; pooled: indices of the results' rows, and value and standard deviation
-    and 95 % interval of θ_ij from all of the archive.
+    no unit twice, was measured; units, campaigns: how many; outliers, drifts: those beyond chance; pooled: indices of
+    the results' rows, and value and standard deviation and 95 % interval of θ_ij from all of the archive.
     """
 
     parameter: str

@@ -28,6 +28,7 @@ __all__ = [
     "history_figure",
     "isolability_rows",
     "noise_rows",
+    "number",
     "outcome_rows",
     "parameter_rows",
     "parted_words",
