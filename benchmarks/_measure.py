@@ -30,8 +30,11 @@ def machine() -> str:
         model = names[0].strip() if names else model
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     versions = ", ".join(f"{name} {version(name)}" for name in ("jax", "numpy"))
+    cores = str(os.cpu_count())
+    if hasattr(os, "sched_getaffinity") and len(own := os.sched_getaffinity(0)) < int(cores):
+        cores = f"{len(own)} of {cores}"
     return (
-        f"{os.cpu_count()} cores ({model}) shared with other work (load average {os.getloadavg()[0]:.1f} at the end), "
+        f"{cores} cores ({model}) shared with other work (load average {os.getloadavg()[0]:.1f} at the end), "
         f"{memory:.0f} GiB, {gpu() or 'no GPU'}, Python {platform.python_version()}, {versions}"
     )
 

@@ -19,7 +19,7 @@ from gyromodel.batch import (
     write_table,
 )
 from gyromodel.model_files import read_model
-from gyromodel.report import with_uncertainty
+from gyromodel.report import number, with_uncertainty
 
 
 def batch_to(archive: str, model: Path, output: Path, diagnosing: bool, workers: int, scheduler: str | None) -> Batch:
@@ -47,9 +47,12 @@ def units_of(results: Path, output: Path | None) -> Sequence[Parameter]:
 
 def print_units(found: Sequence[Parameter]) -> None:
     """A table, and what stands out."""
+    if not found:
+        print("Nothing to compare: no parameter has standard uncertainties in two campaigns.")
+        return
     rows = [
         (f"{s.parameter}{' ' * bool(s.axis)}{s.axis}", str(s.units), str(s.campaigns),
-         with_uncertainty(s.mean, s.mean_std, s.unit), f"{s.between.value:.3g}", f"{s.within.value:.3g}")
+         with_uncertainty(s.mean, s.mean_std, s.unit), number(s.between.value, 3), number(s.within.value, 3))
         for s in found
     ]  # fmt: skip
     print_table(("parameter", "units", "campaigns", "mean", "unit to unit", "campaign to campaign"), rows)

@@ -26,16 +26,18 @@ class Place:
         """A complaint about this place."""
         return complaint(self.path, self.node.start_mark.line, message)
 
-    def mapping(self, allowed: tuple[str, ...], what: str, *, complete: bool = False) -> dict[str, Place]:
-        """Its values by key, all keys allowed; with `complete`, all there."""
+    def mapping(
+        self, allowed: tuple[str, ...], what: str, *, complete: bool = False, also: tuple[str, ...] = ()
+    ) -> dict[str, Place]:
+        """Its values by key, all keys allowed; with `complete`, all there, and those of `also` if they are."""
         if not isinstance(self.node, yaml.MappingNode):
             raise self.error(f"expected {what} as key: value pairs")
         found: dict[str, Place] = {}
         for key, value in self.node.value:
             place = Place(self.path, key)
             name = place.text()
-            if name not in allowed:
-                raise place.error(f"unknown key {name!r} in {what}; known are {', '.join(allowed)}")
+            if name not in (*allowed, *also):
+                raise place.error(f"unknown key {name!r} in {what}; known are {', '.join((*allowed, *also))}")
             if name in found:
                 raise place.error(f"{name!r} appears twice")
             found[name] = Place(self.path, value)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Float
 from scipy.signal import savgol_filter
 
-from gyromodel._checks import MISSING_STEP
+from gyromodel._checks import MISSING_STEP, CampaignError
 from gyromodel.campaign import AXES, Campaign
 
 # Seconds, and at least so many samples, through which a cubic is laid. Sampled at 100 Hz or faster it passes 99 % of a
@@ -17,6 +18,20 @@ WINDOW, FEWEST = 0.05, 5
 # Columns that are a reference rate, so that none is taken from the attitude.
 _REFERENCE = re.compile(r"rate(_(?!estimated).*)?")
 COLUMNS = tuple(f"attitude_{part}" for part in "wxyz")
+
+
+def refuse_navigated(campaigns: Iterable[Campaign]) -> None:
+    """What `navigate` has computed from the outputs says nothing of them.
+
+    Raises:
+        CampaignError: a campaign has such columns.
+    """
+    for campaign in campaigns:
+        if "navigated" in campaign.metadata:
+            raise CampaignError(
+                f"{campaign.name}: its attitude, velocity and position were computed from its outputs, and tell "
+                "nothing of the gyro: take the log that was navigated"
+            )
 
 
 def with_reference_rates(campaign: Campaign) -> tuple[Campaign, str]:

@@ -227,7 +227,12 @@ def sensitivity(
         Path | None, typer.Option(metavar="PLAN2.yaml", help="The next campaign's plan; the mission's by default.")
     ] = None,
     outcome: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="rate, angle, peak, bias_temperature, attitude, position.")
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="rate, angle, peak, attitude, position, bias_temperature, scale_factor, scale_temperature, "
+            "scale_nonlinearity.",
+        ),
     ] = None,
     candidates: Annotated[
         Path | None, typer.Option(metavar="C.yaml", help="Parts of which to make the best test plan.")

@@ -118,7 +118,8 @@ def reference_error(compensated: Campaign) -> ErrorAgainstReference | None:
     Args:
         compensated: what `compensate` returned.
     """
-    rated, _ = with_reference_rates(compensated)
+    # A navigated attitude is made of the outputs, and holds the rates against themselves.
+    rated = compensated if "navigated" in compensated.metadata else with_reference_rates(compensated)[0]
     compensated, _ = average(rated, len(rated), MEAN_OF_ATTITUDE * (rated is not compensated))
     errors = reference_errors(compensated)
     if errors is None or errors.shape[1] < 2 * PARTS:

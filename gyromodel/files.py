@@ -213,10 +213,7 @@ def read_metadata(path: Path) -> Mapping[str, Any]:
 
         return zarr.open_group(path, mode="r").attrs
     if suffix == ".nc":
-        import h5py
-
-        with h5py.File(path, "r") as file:
-            return dict(file.attrs)
+        return _netcdf_metadata(path)
     with reading_parts(path) as opened:
         assert opened is not None
         return opened[1]
@@ -232,13 +229,17 @@ def _write_parquet(campaign: Campaign, path: Path) -> None:
     parquet.write_table(table, path, compression="zstd", write_page_checksum=True)
 
 
-def _read_netcdf(path: Path) -> Contents:
+def _netcdf_metadata(path: Path) -> dict[str, Any]:
     import h5py
 
+    with h5py.File(path, "r") as file:
+        _check_heaps(path)
+        return dict(file.attrs)
+
+
+def _read_netcdf(path: Path) -> Contents:
     with _damage("NetCDF-4"):
-        with h5py.File(path, "r") as file:
-            _check_heaps(path)
-            dict(file.attrs)  # h5netcdf prints a traceback where these are damaged, h5py raises
+        _netcdf_metadata(path)  # h5netcdf prints a traceback where these are damaged, h5py raises
         return _read_dataset(path, engine="h5netcdf")
 
 

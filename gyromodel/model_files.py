@@ -20,7 +20,7 @@ from gyromodel.effects.drivers import BiasColumn
 from gyromodel.estimate import Calibration, Estimate, validity_unit
 from gyromodel.model import GyroModel, ModelError, make_effect, parameter_unit
 from gyromodel.noise import MARKOV_TIME, NOISE_UNITS, check_stated, noise_units
-from gyromodel.numerics.uncertain import Uncertain
+from gyromodel.numerics.uncertain import Source, Uncertain
 from gyromodel.signals import Record
 from gyromodel.units import convertible, from_internal, internal_unit
 
@@ -29,6 +29,8 @@ RECORD_KEYS = ("fit", "software")
 # What a scale factor can be: output per rate; a plain number where the output is itself a rate.
 GAIN_UNITS = ("count/deg", "count/(deg/s)", "bit/deg", "bit/(deg/s)", "V/(deg/s)", "V/deg", "A/(deg/s)", "1/deg", "")
 FIT_KEYS = ("degrees_of_freedom", "validity", "data_hash", "covariance")
+# By how much a factor's square may differ from the covariance, of its size.
+SAME_COVARIANCE = 1e-6
 SETTING_UNITS = {"reference": "degC", "full_rate": "deg/s", "lowest": "deg/s"}
 
 
@@ -50,7 +52,7 @@ def read_calibration(path: str | Path) -> Calibration:
     model, top = _read(Path(path))
     if "fit" not in top:
         return Calibration(model)
-    fit = top["fit"].mapping(FIT_KEYS, "fit", complete=True)
+    fit = top["fit"].mapping(FIT_KEYS, "fit", complete=True, also=("sources",))
     validity = {}
     columns = {"rate", "temperature", *(n for e in model.effects for n in thermometers(e.columns_needed))}
     for name, place in fit["validity"].mapping(tuple(sorted(columns)), "validity").items():
@@ -62,7 +64,24 @@ def read_calibration(path: str | Path) -> Calibration:
     degrees = fit["degrees_of_freedom"].number_in("")
     if degrees < 0 or degrees != int(degrees):
         raise fit["degrees_of_freedom"].error("degrees of freedom are a whole number, not below zero")
-    return Calibration(model, covariance, validity, int(degrees), fit["data_hash"].text())
+    sources = _read_sources(fit["sources"], covariance) if "sources" in fit else {}
+    return Calibration(model, covariance, validity, int(degrees), fit["data_hash"].text(), sources)
+
+
+def _read_sources(place: Place, covariance: np.ndarray) -> dict[Source, np.ndarray]:
+    sources = {}
+    for item in place.items("sources"):
+        found = item.mapping(("name", "factor"), "a source", complete=True, also=("degrees_of_freedom",))
+        rows = [row.items("a row of the factor") for row in found["factor"].items("the factor")]
+        if len(rows) != len(covariance) or len({len(row) for row in rows}) != 1:
+            raise found["factor"].error(f"the factor needs {len(covariance)} rows of equally many numbers")
+        degrees = found["degrees_of_freedom"].number_in("") if "degrees_of_freedom" in found else np.inf
+        part = np.array([[entry.number_in("") for entry in row] for row in rows]).reshape(len(rows), -1)
+        sources[Source(found["name"].text(), degrees)] = part
+    size = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
+    if (np.abs(sum((a @ a.T for a in sources.values()), -covariance)) > SAME_COVARIANCE * size).any():
+        raise place.error("the sources do not add up to the covariance; fit the model again")
+    return sources
 
 
 def _read_covariance(place: Place, names: list[str]) -> np.ndarray:
@@ -288,9 +307,19 @@ def _fit_record(estimate: Estimate) -> dict[str, Any]:
         "covariance": {
             "parameters": parameter_names(estimate.model),
             "unit": "internal units of each parameter (rad, s, °C, count)",
-            "matrix": [[float(v) for v in row] for row in estimate.covariance],
+            "matrix": estimate.covariance.tolist(),
         },
-    }
+    } | ({"sources": _sources(estimate)} if estimate.inherited else {})
+
+
+def _sources(estimate: Estimate) -> list[dict[str, Any]]:
+    """Where the errors of a fit in stages come from."""
+    return [
+        {"name": source.name}
+        | ({"degrees_of_freedom": source.degrees_of_freedom} if np.isfinite(source.degrees_of_freedom) else {})
+        | {"factor": part.tolist()}
+        for source, part in estimate.parameters.sources.items()
+    ]
 
 
 def parameter_names(model: GyroModel) -> list[str]:

@@ -10,7 +10,7 @@ import pytest
 from pyarrow import parquet
 from scipy.stats import binom
 
-from gyromodel import CampaignError
+from gyromodel import CampaignError, cli
 from gyromodel.batch import Parameter, copies, pooled_table, read_results, unit_statistics
 from gyromodel.batch._results import SCHEMA
 
@@ -120,8 +120,34 @@ def test_units_of_measure_change_nothing_and_failures_are_left_out(seed: int):
     assert pooled["campaign"].to_pylist() == [f"c{i}" for i in range(12)]
 
 
-def test_one_unit_says_nothing_of_units(seed: int):
-    assert unit_statistics(drawn(np.random.default_rng(seed), 1, 3, 1.0, 0.0)[0]) == []
+@pytest.mark.parametrize("campaigns", [3, 8])
+def test_one_unit_has_its_mean_its_scatter_and_its_drift(campaigns: int, seed: int):
+    """Units say nothing of each other where there is one; its campaigns do, and a drift is seen by itself."""
+    rng = np.random.default_rng(seed)
+    archives, covered, alarms = 120, 0, 0
+    for _ in range(archives):
+        table, true = drawn(rng, 1, campaigns, 1.0, rng.choice([0.0, 0.5, 3.0]))
+        found = statistics(table)
+        k = rng.integers(len(true))
+        covered += bool(found.pooled["low"][k] <= true[found.pooled["row"]][k] <= found.pooled["high"][k])
+        alarms += bool(found.drifts)
+        assert (found.units, found.campaigns, found.outliers) == (1, campaigns, ())
+        assert np.isnan(found.between.value)
+    assert covered >= binom.ppf(RARE, archives, 0.94), f"seed {seed}: {covered} of {archives}"
+    assert alarms <= binom.isf(RARE, archives, 0.01), f"seed {seed}: {alarms} of {archives}"
+    drifts = [statistics(drawn(rng, 1, 8, 1.0, 0.0, drift=5.0)[0]).drifts for _ in range(20)]
+    assert [d.unit for [d] in drifts] == ["U0"] * 20
+    assert abs(np.mean([d.rate - 5.0 for [d] in drifts])) < 5 * np.mean([d.std for [d] in drifts]) / np.sqrt(20)
+
+
+def test_one_campaign_has_nothing_to_compare(tmp_path: Path, seed: int, capsys: pytest.CaptureFixture[str]):
+    assert unit_statistics(drawn(np.random.default_rng(seed), 1, 1, 1.0, 0.0)[0]) == []
+    whole = pa.Table.from_pylist([], SCHEMA).replace_schema_metadata({"gyromodel": "{}"})
+    parquet.write_table(whole, tmp_path / "r.parquet")
+    with pytest.raises(SystemExit) as done:
+        cli.main(["units", str(tmp_path / "r.parquet")])
+    assert done.value.code == 0
+    assert "Nothing to compare" in capsys.readouterr().out
 
 
 def test_copies_of_a_campaign_count_once(seed: int):

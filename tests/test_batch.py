@@ -386,6 +386,23 @@ def test_archives_of_every_kind(tmp_path: Path):
         entries(str(tmp_path / "empty"))
 
 
+def test_arrays_of_a_zarr_campaign_are_no_campaigns(tmp_path: Path):
+    """However its descriptions are laid out, and where one is damaged."""
+    folder = tmp_path / "archive"
+    for name in ("compact.zarr", "damaged.zarr"):
+        write_campaign(campaign(0), folder / name)
+    for path in (folder / "compact.zarr").rglob("zarr.json"):
+        path.write_text(json.dumps(json.loads(path.read_text()), separators=(",", ":")))
+    (folder / "damaged.zarr" / "output" / "zarr.json").write_text('{"node_type"')
+    (tmp_path / "model.yaml").write_text(MODEL)
+    for where in (None, tmp_path / "archive" / "*", tmp_path / "archive" / "**"):
+        found = entries(str(where or folder))
+        assert [Path(entry.path).name for entry in found] == ["compact.zarr", "damaged.zarr"]
+    done = here(tmp_path)
+    assert (done.campaigns, done.failed) == (2, 1)
+    assert "damaged" in str(done.table["reason"].to_pylist()[-1])
+
+
 def test_what_commands_have_written_is_no_campaign(tmp_path: Path):
     """Tables, an exported calibration and compensated copies, in the archive's folder; a damaged file is told of."""
     place = archive(tmp_path, 3)

@@ -152,6 +152,15 @@ def test_ctrl_c_ends_in_one_sentence_from_the_first_import_on(tmp_path: Path, lo
     assert re.fullmatch("gyromodel: interrupted; .*\n", done.stderr)
 
 
+def test_ctrl_c_after_the_last_line_is_too_late():
+    ending = "import atexit, signal; from gyromodel.__main__ import main\n"
+    ending += "atexit.register(signal.raise_signal, signal.SIGINT); main()"
+    command = [sys.executable, "-c", ending, "effects", "bias", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert json.loads(done.stdout)
+
+
 def test_the_module_runs_as_a_program():
     done = subprocess.run([sys.executable, "-m", "gyromodel", "fit"], capture_output=True, text=True, check=False)
     assert done.returncode == 2

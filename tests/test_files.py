@@ -25,6 +25,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from gyromodel._checks import CampaignError
+from gyromodel.batch import entries
 from gyromodel.campaign import LARGEST, Campaign
 from gyromodel.files import read_campaign, replacing, write_campaign
 from tests.helpers import MUTANTS, SHARED_FOLDER, mutated, small_campaign
@@ -314,6 +315,7 @@ def test_hdf5_texts_with_a_wrong_length(tmp_path: Path):
         with pytest.raises(CampaignError) as caught:
             read_campaign(path)
         refused += str(caught.value)
+        assert [entry.campaign for entry in entries(str(tmp_path))] == ["a.nc"]
     assert "is damaged: a block of texts in it does not add up" in refused
 
 

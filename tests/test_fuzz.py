@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 
 from gyromodel import cli
+from gyromodel.batch import read_results
 from gyromodel.campaign import Campaign
-from gyromodel.files import write_campaign
+from gyromodel.files import SUFFIXES, write_campaign
 
-FILES = 2000
+FILES, ARCHIVE = 2000, 300
 ROWS = 48
 # Seconds that one command may take: a fit that compiles anew takes some.
 LIMIT = 60
@@ -234,3 +235,30 @@ def test_every_file_ends_in_a_result_or_a_sentence(
         monkeypatch.chdir(tmp_path)
     # Neither all refused nor all let through.
     assert 0.1 * FILES / 4 < done < 0.9 * FILES / 4
+
+
+@pytest.mark.long
+def test_every_damaged_campaign_of_an_archive_is_a_row(seed: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Of every kind of file; what is left whole is fitted beside them."""
+    rng = np.random.default_rng(seed)
+    archive = tmp_path / "archive"
+    archive.mkdir()
+    for k in range(ARCHIVE):
+        path = archive / f"{k:03d}{rng.choice(SUFFIXES)}"
+        write_campaign(campaign(), path)
+        inside = [p for p in [path, *path.rglob("*")] if p.is_file()]
+        victim = inside[int(rng.integers(len(inside)))]
+        victim.write_bytes(bytes_changed(rng, victim.read_bytes()))
+    (tmp_path / "model.yaml").write_text(MODEL, encoding="utf-8")
+    results = tmp_path / "results.parquet"
+    with soon(), pytest.raises(SystemExit) as ended:
+        cli.main(["batch", str(archive), "--model", str(tmp_path / "model.yaml"), "-o", str(results)])
+    said = capsys.readouterr().err
+    assert ended.value.code in (0, 1, None), f"seed {seed}: {said}"
+    table = read_results(results).to_pandas()
+    assert set(table["campaign"]) == {p.name for p in archive.iterdir()}, f"seed {seed}"
+    lost = table[table["status"] == "failed"]
+    assert not lost["campaign"].duplicated().any(), f"seed {seed}"
+    assert not lost["reason"].str.contains("internal error").any(), f"seed {seed}: {lost['reason'].tolist()}"
+    assert 0.05 * ARCHIVE < len(lost) < ARCHIVE, f"seed {seed}"
+    assert np.isfinite(table.loc[(table["status"] == "fitted") & table["std"].notna(), "value"]).all()

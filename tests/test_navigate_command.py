@@ -108,3 +108,20 @@ def test_what_cannot_be_navigated_is_refused(broken, said: str, tmp_path: Path, 
     assert said in message
     assert message.count("\n") == 1
     assert not (tmp_path / "navigated.csv").exists()
+
+
+def test_what_was_navigated_is_no_reference(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Its attitude is made of the outputs: a fit to it would find a perfect gyro."""
+    navigated(log(), tmp_path)
+    model, source = tmp_path / "model.yaml", tmp_path / "out" / "navigated.csv"
+    model.write_text("effects: [{effect: scale_factor, value: 1.1}]")
+    for command in ("fit", "diagnose"):
+        with pytest.raises(SystemExit) as done:
+            cli.main([command, str(source), "--axis", "x", "--model", str(model), "-o", str(tmp_path / command)])
+        assert done.value.code == 1
+        assert "were computed from its outputs, and tell nothing of the gyro" in capsys.readouterr().err
+        assert not [*(tmp_path / command).rglob("*.*")]
+    with pytest.raises(SystemExit) as done:
+        cli.main(["compensate", str(model), str(source), "--axis", "x", "-o", str(tmp_path / "c.csv"), "--json"])
+    assert done.value.code == 0
+    assert json.loads(capsys.readouterr().out)["reference_error"] is None

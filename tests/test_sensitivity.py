@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -19,9 +20,9 @@ from scipy.stats import norm
 from gyromodel import CampaignError, cli
 from gyromodel.campaign import Campaign
 from gyromodel.effects.drivers import Bias
-from gyromodel.effects.scale import ScaleFactor, ScaleNonlinearity
+from gyromodel.effects.scale import ScaleFactor, ScaleNonlinearity, ScaleTemperature
 from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureRate
-from gyromodel.estimate import Calibration, fit
+from gyromodel.estimate import Calibration, fit, two_stage
 from gyromodel.model import GyroModel, ModelError, simulate
 from gyromodel.model_files import write_model
 from gyromodel.numerics.uncertain import Uncertain
@@ -152,6 +153,56 @@ def test_stages_are_kept_apart():
     both = Uncertain(np.asarray(model.vector()), model.with_vector, {**first.sources, **second.sources})
     stages = sensitivity(both, mission(), ["rate"]).results[0].budget.stages
     assert stages == {"rate table": pytest.approx(0.25), "chamber": pytest.approx(0.75)}
+
+
+def test_figures_of_merit_of_the_scale_factor_have_closed_forms(seed: int):
+    """Of a part k of the output at full rate as its square, the best line leaves k (x² − 1/3) of |x| ≤ 1."""
+    effects = (
+        ScaleFactor(value=1.0, unit="1"),
+        ScaleNonlinearity(coefficients=jnp.array([300e-6]), powers=(2,), full_rate=np.deg2rad(10.0)),
+        ScaleTemperature(coefficient=-20e-6, reference=25.0),
+    )
+    flight = mission(temperature=RAMP)
+    flight = flight.with_column("rate", np.linspace(-10.0, 10.0, ROWS), "deg/s")
+    covariance = np.diag([50e-6, 30e-6, 2e-6]) ** 2
+    names = ["scale_factor", "scale_nonlinearity", "scale_temperature"]
+    results = sensitivity(Calibration(GyroModel(effects, NOISE), covariance), flight, names, seed=seed).results
+    factor, nonlinearity, temperature = (r.budget for r in results)
+    # The mission's mean temperature is 40 °C, its mean rate zero.
+    assert (factor.unit, factor.value) == ("ppm", pytest.approx(0.0, abs=1e-6))
+    assert factor.std == pytest.approx(np.hypot(50.0, 2.0 * 15.0), rel=1e-2)
+    assert (nonlinearity.value, nonlinearity.std) == (pytest.approx(100.0, rel=0.02), pytest.approx(10.0, rel=0.02))
+    assert (temperature.value, temperature.unit) == (pytest.approx(20.0, rel=1e-6), "ppm/degC")
+    assert temperature.std == pytest.approx(2.0, rel=1e-6)
+    assert all(r.drawn.agrees for r in results)
+
+
+def test_stages_go_through_the_model_s_file(tmp_path: Path, capsys: pytest.CaptureFixture[str], seed: int):
+    """A bias from a soak, held while its temperature's coefficient is fitted."""
+    soak, ramp = (mission(temperature=t) for t in (20.0, RAMP))
+    model = GyroModel(THERMAL, WHITE_ALONE)
+    first = fit(simulate(model, soak, seed=seed % 1000), GyroModel(THERMAL[:1], WHITE_ALONE), name="soak")
+    held = GyroModel((first.model.effects[0], THERMAL[1]), WHITE_ALONE, frozenset({("bias", "value")}))
+    second = two_stage(first, fit(simulate(model, ramp, seed=seed % 1000 + 1), held, name="ramp"))
+    path, plan = tmp_path / "model.yaml", tmp_path / "plan.yaml"
+    write_model(second, path)
+    plan.write_text(PLAN, encoding="utf-8")
+    assert run(path, "--plan", plan, "--outcome", "angle", "--json") == 0
+    stages = json.loads(capsys.readouterr().out)["outcomes"]["angle"]["stages"]
+    assert set(stages) == {"soak", "ramp"}
+    assert stages["soak"] == pytest.approx(1 - second.own_covariance[0, 0] / second.covariance[0, 0])
+    assert 0.05 < stages["soak"] < 0.95
+    text = path.read_text(encoding="utf-8")
+    for change, said in (
+        (("- name: soak", "- nam: soak"), "unknown key 'nam'"),
+        (("degrees_of_freedom: 199.0", "degrees_of_freedom: many"), "many"),
+        (("factor:\n    - - [^\n]*", "factor:\n    - - 1.0"), "do not add up"),
+    ):
+        changed = re.sub(*change, text, count=1)
+        assert changed != text
+        path.write_text(changed, encoding="utf-8")
+        assert run(path, "--plan", plan, "--outcome", "angle") == 1
+        assert said in capsys.readouterr().err
 
 
 @pytest.mark.long

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import json
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -111,7 +112,7 @@ def _campaigns_among(paths: Iterable[Path]) -> Iterator[Path]:
     """Files, and Zarr groups that hold no further ones in place of their parts."""
     for path in paths:
         if is_zarr(path):
-            yield from () if _is_array(path) else _groups_below(path)
+            yield from _groups_below(path) if _is_group(path) or not is_zarr(path.parent) else ()
         elif not path.is_dir() and not any(map(is_zarr, path.parents)):
             yield path
 
@@ -156,16 +157,17 @@ def _nested(one: str, other: str) -> bool:
 
 def _groups_below(root: Path) -> list[Path]:
     """The Zarr groups that hold no further ones."""
-    below = [path for path in root.iterdir() if path.is_dir() and is_zarr(path)]
-    groups = [path for path in below if not _is_array(path)]
+    groups = [path for path in root.iterdir() if path.is_dir() and _is_group(path)]
     return [leaf for path in groups for leaf in _groups_below(path)] or [root]
 
 
-def _is_array(path: Path) -> bool:
-    if (path / ".zarray").exists():
+def _is_group(path: Path) -> bool:
+    """Whether a folder says that it is one: what is damaged is a part of the group that it is in."""
+    if (path / ".zgroup").exists():
         return True
-    meta = path / "zarr.json"
-    return meta.exists() and '"node_type": "array"' in meta.read_text(encoding="utf-8", errors="replace")
+    with suppress(OSError, ValueError, TypeError, KeyError, RecursionError):
+        return json.loads((path / "zarr.json").read_bytes())["node_type"] == "group"
+    return False
 
 
 def _manifest(path: Path) -> list[str] | None:

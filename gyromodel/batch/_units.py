@@ -37,6 +37,9 @@ class Spread(NamedTuple):
     high: float
 
 
+UNKNOWN = Spread(np.nan, np.nan, np.nan)
+
+
 class Outlier(NamedTuple):
     """A unit that the others do not lead to expect: its value, theirs and by how many standard deviations it is off."""
 
@@ -59,9 +62,9 @@ class Drift(NamedTuple):
 class Parameter(NamedTuple):
     """One parameter over an archive.
 
-    parameter, axis, unit: as in the results; mean, mean_std: μ; between, within: τ and κ; units, campaigns: how
-    many; outliers, drifts: those beyond chance; pooled: indices of the results' rows, and value and standard deviation
-    and 95 % interval of θ_ij from all of the archive.
+    parameter, axis, unit: as in the results; mean, mean_std: μ; between, within: τ and κ, NaN where only one unit, or
+    no unit twice, was measured; units, campaigns: how many; outliers, drifts: those beyond chance; pooled: indices of
+    the results' rows, and value and standard deviation and 95 % interval of θ_ij from all of the archive.
     """
 
     parameter: str
@@ -121,7 +124,7 @@ def unit_statistics(results: pa.Table) -> list[Parameter]:
         results: as `run_batch` writes them.
 
     Returns:
-        One entry for each parameter, and axis, that two units or more have.
+        One entry for each parameter, and axis, that two campaigns or more have.
     """
     return [found for rows in _by_parameter(results) if (found := _statistics(rows)) is not None]
 
@@ -180,10 +183,11 @@ def _posterior(value: np.ndarray, std: np.ndarray, unit: np.ndarray) -> _Posteri
     count = np.bincount(unit)
     reach = BEYOND * max(np.std(value), np.median(std) / len(value))
     levels = reach * np.linspace(0.0, 1.0, LEVELS) ** 2
-    within = levels if count.max() > 1 else np.zeros(1)
+    # What nothing shows is not there: of one unit, or of units measured once.
+    between, within = (levels if several else np.zeros(1) for several in (len(count) > 1, count.max() > 1))
     # Each cell of the grid counts by its area, as levels are not even.
-    area = np.outer(np.gradient(levels), np.gradient(within) if len(within) > 1 else np.ones(1)).ravel()
-    between, within = (part.ravel() for part in np.meshgrid(levels, within, indexing="ij"))
+    area = np.outer(*(np.gradient(x) if len(x) > 1 else np.ones(1) for x in (between, within))).ravel()
+    between, within = (part.ravel() for part in np.meshgrid(between, within, indexing="ij"))
     mean, variance, misfit = _of_units(value, std, unit, within)
     total = between**2 + variance
     precision = (1 / total).sum(0)
@@ -207,7 +211,7 @@ def _of_units(value: np.ndarray, std: np.ndarray, unit: np.ndarray, within: np.n
 
 
 def _statistics(rows: _Rows) -> Parameter | None:
-    if len(rows.names) < 2:
+    if len(rows.value) < 2:
         return None
     # Sizes of one, so that no square overflows.
     scale = float(max(np.std(rows.value), np.median(rows.std)))
@@ -219,7 +223,8 @@ def _statistics(rows: _Rows) -> Parameter | None:
     pooled = {name: x * scale + shift * (name != "std") for name, x in _pooled(value, std, rows.unit, p).items()}
     return Parameter(
         rows.parameter, rows.axis, rows.unit_text, mean * scale + shift, mean_std * scale,
-        _spread(p.between * scale, p.weight), _spread(p.within * scale, p.weight),
+        _spread(p.between * scale, p.weight) if len(rows.names) > 1 else UNKNOWN,
+        _spread(p.within * scale, p.weight) if len(rows.names) < len(value) else UNKNOWN,
         len(rows.names), len(value),
         tuple(_outliers(rows, value, std, scale, shift)), tuple(_drifts(rows)),
         {"row": rows.index, **pooled},

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gyromodel._checks import CampaignError
-from gyromodel.attitude import with_reference_rates
+from gyromodel.attitude import refuse_navigated, with_reference_rates
 from gyromodel.averages import MEAN_OF_ATTITUDE, MOST_TURN, average, turning
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._variance import steps_of_output, stretch_still
@@ -59,6 +59,7 @@ def read(measured: Sequence[Campaign], without: str = "") -> Data:
 
 
 def _of_gyro(measured: Sequence[Campaign]) -> Data:
+    refuse_navigated(measured)
     given, of_attitude = zip(*(with_reference_rates(c) for c in measured), strict=True)
     campaigns = [at_rest(c) for c in given]
     findings = [line for line in of_attitude if line]

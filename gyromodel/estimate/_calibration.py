@@ -10,6 +10,7 @@ import equinox as eqx
 import numpy as np
 
 from gyromodel.model import GyroModel, ModelError
+from gyromodel.numerics.uncertain import Source
 from gyromodel.units import factor, internal_unit
 
 
@@ -38,6 +39,8 @@ class Calibration:
         validity: lowest and highest value that the fit has seen, by column, internal units.
         degrees_of_freedom: of the fit.
         data_hash: of the campaigns that were fitted.
+        sources: of several that the errors come from, such as the stages of a fit, a factor each (one row a parameter,
+            internal units), their squares A Aᵀ adding up to the covariance.
 
     Raises:
         ModelError: a parameter or a reference point has no value, or the covariance is of other parameters.
@@ -48,6 +51,7 @@ class Calibration:
     validity: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     degrees_of_freedom: int = 0
     data_hash: str = ""
+    sources: Mapping[Source, np.ndarray] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         for effect in self.model.effects:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gyromodel.attitude import with_reference_rates
+from gyromodel.attitude import refuse_navigated, with_reference_rates
 from gyromodel.averages import MEAN_OF_ATTITUDE, average
 from gyromodel.campaign import Campaign
 from gyromodel.estimate._estimate import Estimate, EstimateError, noise_coefficients
@@ -71,8 +71,9 @@ def read_for_fit(campaigns: Sequence[Campaign]) -> Record:
     """The signals that `fit` fits to.
 
     Raises:
-        CampaignError: the campaigns do not match, or one has no output of a gyro.
+        CampaignError: the campaigns do not match, or one has no output of a gyro, or has been navigated.
     """
+    refuse_navigated(campaigns)
     rated = [with_reference_rates(c)[0] for c in campaigns]
     means = [MEAN_OF_ATTITUDE * (r is not c) for r, c in zip(rated, campaigns, strict=True)]
     return read_signals([average(at_rest(r), len(r), s)[0] for r, s in zip(rated, means, strict=True)])

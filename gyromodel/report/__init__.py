@@ -4,7 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from gyromodel.report._isolation import isolability_rows, parted_words
-from gyromodel.report._numbers import with_uncertainty
+from gyromodel.report._numbers import number, with_uncertainty
 from gyromodel.report._page import write_report
 from gyromodel.report._sentence import sentence
 
@@ -28,6 +28,7 @@ __all__ = [
     "history_figure",
     "isolability_rows",
     "noise_rows",
+    "number",
     "outcome_rows",
     "parameter_rows",
     "parted_words",

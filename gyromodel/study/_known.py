@@ -131,12 +131,12 @@ def _one(calibrated: Calibrated) -> tuple[GyroModel, dict[Source, np.ndarray], d
     if isinstance(calibrated, Estimate):
         calibration, sources = calibrated.calibration(), dict(calibrated.parameters.sources)
     else:
-        calibration, sources = calibrated, None
+        calibration, sources = calibrated, dict(calibrated.sources)
     if calibration.covariance is None or not len(calibration.model.slots()):
         raise ModelError(
             "the model has no covariance of free parameters: fit it, or take the model.yaml that fit or diagnose wrote"
         )
-    if sources is None:
+    if not sources:
         sources = {Source("calibration", float(calibration.degrees_of_freedom)): factor_of(calibration.covariance)}
     return calibration.model, sources, dict(calibration.validity)
 

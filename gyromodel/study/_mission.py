@@ -21,6 +21,8 @@ from gyromodel.model import GyroModel, ModelError, check_units
 from gyromodel.platform import Navigation, drift_errors, navigate, pushes_at_rest
 from gyromodel.signals import Record, read_signals
 
+# Outcomes that are told where none is named, if a mission has them.
+USUAL = ("rate", "angle", "peak", "bias_temperature", "attitude", "position")
 # Temperatures (°C) at which the bias is taken for its temperature sensitivity, apart by so much, and the room's.
 TEMPERATURE_STEP, ROOM = 1.0, 25.0
 
@@ -116,26 +118,63 @@ def bias_temperature(mission: Mission, *models: GyroModel) -> Float[Array, " axi
 
     B is the steady bias: at rest, all other columns at their means over the mission.
     """
-    known = mission.duration > 0
-    values = mission.signals["temperature"]
-    low, high = jnp.min(values, where=known, initial=jnp.inf), jnp.max(values, where=known, initial=-jnp.inf)
-    middle = jnp.clip(ROOM, low, high)
-    grid = jnp.linspace(low, high, len(values))
-    steady = {name: jnp.full_like(v, jnp.mean(v, where=known)) for name, v in mission.signals.items()}
-    for name in steady:
-        if name == "rate" or name.endswith("_rate"):
-            steady[name] = jnp.zeros_like(grid)
-        elif name.startswith("temperature"):
-            steady[name] = grid
-    change = grid - middle
-    far = jnp.abs(change) >= jnp.minimum(TEMPERATURE_STEP, 0.5 * (high - low))
+    return jnp.stack([_slope(mission, lambda at, m=m: m.predict(at) / m.slope(at)) for m in models])
+
+
+def scale_temperature(mission: Mission, *models: GyroModel) -> Float[Array, " axis"]:
+    """St = max_i |K(T_i)/K(T_m) − 1|/|T_i − T_m| (1/°C), K the scale factor at rest, as `bias_temperature`."""
+    return jnp.stack([_slope(mission, lambda at, m=m: m.slope(at), relative=True) for m in models])
+
+
+def scale_factor(mission: Mission, *models: GyroModel) -> Float[Array, " axis"]:
+    """Relative error of the local scale factor, its mean over the mission."""
+    slopes = jnp.stack([model.slope(mission.signals) for model in models])
+    return jnp.mean(slopes / mission.slope - 1.0, axis=1, where=mission.duration > 0)
+
+
+def scale_nonlinearity(mission: Mission, *models: GyroModel) -> Float[Array, " axis"]:
+    """Kn = max_i |F(Ω_i) − line|/|K (Ω_max − Ω_min)| over the mission's rates Ω, K the slope of the line.
+
+    The line is that of least squares; all other columns are at their means over the mission.
+    """
+    rates = _grid(mission, "rate")
+    centred = rates - jnp.mean(rates)
     found = []
     for model in models:
-        bias = model.predict(steady) / model.slope(steady)
-        room = jnp.interp(middle, grid, bias)
-        ratio = jnp.abs(bias - room) / jnp.where(far, jnp.abs(change), 1.0)
-        found.append(jnp.max(jnp.where(far, ratio, 0.0)))
+        output = model.predict(_steady(mission) | {"rate": rates})
+        slope = jnp.sum(centred * output) / jnp.sum(centred**2)
+        off = output - jnp.mean(output) - slope * centred
+        found.append(jnp.max(jnp.abs(off)) / jnp.abs(slope * (rates[-1] - rates[0])))
     return jnp.stack(found)
+
+
+def _slope(mission: Mission, of: Callable[[dict[str, Array]], Array], relative: bool = False) -> Array:
+    """Largest ratio of a steady quantity's change to that of the temperature, from the one nearest to the room's."""
+    grid = _grid(mission, "temperature")
+    at = _steady(mission)
+    at |= {name: grid for name in at if name.startswith("temperature") and not name.endswith("_rate")}
+    change = grid - (middle := jnp.clip(ROOM, grid[0], grid[-1]))
+    far = jnp.abs(change) >= jnp.minimum(TEMPERATURE_STEP, 0.5 * (grid[-1] - grid[0]))
+    values = of(at)
+    room = jnp.interp(middle, grid, values)
+    ratio = jnp.abs(values / room - 1.0 if relative else values - room) / jnp.where(far, jnp.abs(change), 1.0)
+    return jnp.max(jnp.where(far, ratio, 0.0))
+
+
+def _grid(mission: Mission, name: str) -> Float[Array, " sample"]:
+    """Values of a column, evenly from the lowest to the highest of the mission."""
+    known, values = mission.duration > 0, mission.signals[name]
+    ends = jnp.min(values, where=known, initial=jnp.inf), jnp.max(values, where=known, initial=-jnp.inf)
+    return jnp.linspace(*ends, len(values))
+
+
+def _steady(mission: Mission) -> dict[str, Float[Array, " sample"]]:
+    """At rest, nothing changing, all columns at their means over the mission."""
+    known = mission.duration > 0
+    return {
+        name: jnp.full_like(v, 0.0 if name == "rate" or name.endswith("_rate") else jnp.mean(v, where=known))
+        for name, v in mission.signals.items()
+    }
 
 
 OUTCOMES = {
@@ -145,6 +184,9 @@ OUTCOMES = {
         Outcome("angle", "deg", angle),
         Outcome("peak", "deg/h", rate, size="peak", samples=True),
         Outcome("bias_temperature", "deg/h/degC", bias_temperature, of="models"),
+        Outcome("scale_factor", "ppm", scale_factor, of="models"),
+        Outcome("scale_temperature", "ppm/degC", scale_temperature, of="models"),
+        Outcome("scale_nonlinearity", "ppm", scale_nonlinearity, of="models"),
         Outcome("attitude", "arcmin", navigation, entries=slice(0, 3)),
         Outcome("position", "m", navigation, entries=slice(3, 5)),
     )
@@ -207,12 +249,14 @@ _pushes = jax.jit(pushes_at_rest, static_argnums=1)
 
 def offered(mission: Mission) -> list[str]:
     """Outcomes that a mission has, by name."""
-    names = ["rate", "angle", "peak"]
+    names = ["rate", "angle", "peak", "scale_factor"]
     needed = {name for model in mission.models for effect in model.effects for name in effect.columns_needed}
     late = any(effect.remembers for model in mission.models for effect in model.effects)
-    warmed = "temperature" in mission.signals and bool(jnp.ptp(mission.signals["temperature"]) > TEMPERATURE_STEP)
-    if any(name.startswith("temperature") for name in needed) and warmed and not late:
-        names.append("bias_temperature")
+    spans = {} if late else {n: float(jnp.ptp(v[mission.duration > 0])) for n, v in mission.signals.items()}
+    if spans.get("rate", 0.0) > 0:
+        names.append("scale_nonlinearity")
+    if any(name.startswith("temperature") for name in needed) and spans.get("temperature", 0.0) > TEMPERATURE_STEP:
+        names += ["bias_temperature", "scale_temperature"]
     if mission.flight is not None:
         names += ["attitude", "position"]
     return names

@@ -19,7 +19,7 @@ from gyromodel.study._budget import Budget, budget
 from gyromodel.study._draws import BASE, Drawn, Indices, indices, monte_carlo
 from gyromodel.study._instruments import Instrument
 from gyromodel.study._known import Calibrated, Known, known, models_at
-from gyromodel.study._mission import OUTCOMES, Mission, Outcome, offered, read_mission
+from gyromodel.study._mission import OUTCOMES, USUAL, Mission, Outcome, offered, read_mission
 from gyromodel.study._next import REPEATED, NextTest, next_tests
 from gyromodel.units import from_internal
 
@@ -92,7 +92,7 @@ class Sensitivity:
         name, unit = self.results[0].budget.outcome, self.results[0].budget.unit
         as_is = next((t.std[name] for t in self.tests if t.sentence == REPEATED), None)
         better = [t for t in self.tests if t.kind != "test"]
-        if as_is is None or not better or better[0].std[name] > (1 - 1e-3) * as_is:
+        if as_is is None or not better or not better[0].std[name] < (1 - 1e-3) * as_is:
             return None
         what = better[0].sentence.removeprefix("Repeat the run with ").rstrip(".")
         return (
@@ -121,7 +121,8 @@ def sensitivity(
             navigated.
         mission: its profile, such as `read_plan` makes; the output is not used. With metadata latitude_deg it is
             navigated too, from a start at rest.
-        outcomes: names of `OUTCOMES` or outcomes of one's own; all that the mission has by default. The first leads.
+        outcomes: names of `OUTCOMES` or outcomes of one's own; by default the usual ones that the mission has. The
+            first leads.
         design: the campaign whose variants are tried as the next test; the mission by default.
         instruments: errors of the mission's columns.
         design_instruments: errors of the design's columns; those of the mission where that is the design.
@@ -138,7 +139,7 @@ def sensitivity(
     single, record = read_mission(mission, gyros.models)
     gyros = gyros._replace(models=single.models)
     has = offered(single)
-    chosen = [_outcome(outcome, has) for outcome in outcomes] or [OUTCOMES[name] for name in has]
+    chosen = [_outcome(outcome, has) for outcome in outcomes] or [OUTCOMES[name] for name in USUAL if name in has]
     instruments = dict(instruments or {})
     tripled: tuple[Known, Mission] | None = None
     if len(gyros.models) == 1 and any(outcome.name in ("attitude", "position") for outcome in chosen):
@@ -178,7 +179,11 @@ def _outcome(given: str | Outcome, has: Sequence[str]) -> Outcome:
         raise ModelError(f"no outcome is called {given}; there are {', '.join(OUTCOMES)}")
     if given not in has:
         needs = "latitude_deg" if given in ("attitude", "position") else "a temperature that changes and matters"
-        raise ModelError(f"this mission has no outcome {given}: it needs {needs}")
+        needs = "a rate that changes" if given == "scale_nonlinearity" else needs
+        raise ModelError(
+            f"this mission has no outcome {given}: it needs {needs}"
+            + ", and a model without memory" * (given not in ("attitude", "position"))
+        )
     return OUTCOMES[given]
 
 
