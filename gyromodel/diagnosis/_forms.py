@@ -59,7 +59,7 @@ def addition(
     if isinstance(effect, BiasPeriodic):
         effect = _periodic([*lines_of(estimate.model), *_lines(scanner, ranking, estimate.model)])
     for held in estimate.model.effects:
-        effect = effect.joined(held) if held.label == effect.label and effect.label in effect.supersedes else effect
+        effect = effect.joined(held) if held.label in effect.supersedes else effect
     effect = _solved(scanner, estimate, effect, ranking.best_cell(name), pulses).settled()
     rows = np.flatnonzero(scanner.present & np.asarray(effect.unknown(scanner.record.signals)))
     return effect, tuple(map(int, rows)) if len(rows) < MOST_UNKNOWN * scanner.present.sum() else ()

@@ -26,6 +26,8 @@ MAXIMUM_ROUNDS = 12
 MAXIMUM_STEPS = 3
 # A function of time alone must beat a random walk by this much in one run: no real slow noise is exactly a random walk.
 TIME_MARGIN = 15.0
+# The lead (nats) under which what was found grows before anything else is added: by less, nothing is named.
+DOUBT = 3.0
 # Nats by which a cause that no catalogue lists must do better: it is rarer than one that does.
 UNLISTED = 1.0
 
@@ -67,6 +69,10 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
         lines = ranking.statistic.get("bias_periodic", -np.inf)
         remains = "bias_periodic" if full and lines >= threshold else ""
         name, score = ranking.best(drivers=False, but=("bias_periodic" if full else "", "" if path else avoid))
+        for more in (f.name for f in path if f.effect is not None and f.name in f.effect.supersedes and not f.effect.scan):
+            # What was found may have more to it: to a further cause that hardly leads, it is no rival to be ruled out.
+            if ranking.statistic.get(more, -np.inf) > score - DOUBT:
+                name, score = more, ranking.statistic[more]
         if name is None or not _significant(steps, ranking, name, score, first=not path):
             both = _together(steps, path, estimate, ranking)
             if not both or len(path) + 2 > MAXIMUM_ROUNDS or any(unresolved(e, f, scanner.step) for f, e in both):

@@ -135,7 +135,9 @@ def judge(
     findings += [line for step in found if (line := _in_campaign(step.effect))]
     for i, step in enumerate(found):
         ranking, name = selection.left_out.get(i), step.name
-        if ranking is None and len(found) > 1 and not uncontested(step):
+        # What grew is judged whole.
+        grew = sum(f.name == name for f in selection.path) > sum(f.name == name for f in found)
+        if ranking is None and (len(found) > 1 or grew) and not uncontested(step):
             rest = steps.all_but(found, i)
             ranking = rest[1] if rest else None
         if ranking is None or name not in ranking.statistic:

@@ -158,7 +158,7 @@ class Effect(eqx.Module):
         return jnp.zeros(len(signals["time"]), bool)
 
     def joined(self, held: Effect) -> Self:
-        """What takes the place of the same effect in another form where a model holds that, without coefficients."""
+        """What takes the place of one that it supersedes where a model holds that, without coefficients."""
         return self
 
     def settled(self) -> Self:

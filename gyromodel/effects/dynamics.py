@@ -63,7 +63,7 @@ class TimeDelay(Effect):
         """Delays from a part of the sample interval to many; a negative share of a small one is an early output."""
         if not resolved(signals):
             return []
-        return [cls(delay=d) for d in _interval(signals) * np.geomspace(SHORTEST, LONGEST, STEPS)]
+        return [cls(delay=d) for d in interval(signals) * np.geomspace(SHORTEST, LONGEST, STEPS)]
 
 
 class Bandwidth(Effect):
@@ -96,8 +96,7 @@ class Bandwidth(Effect):
 
     def unknown(self, signals: Signals) -> Bool[Array, " sample"]:
         """The first time constants, as only a steady change before them is allowed for."""
-        clock, first, _ = _clock(signals["time"])
-        return clock - clock[first] < FORGOTTEN * self.time_constant
+        return remembered(signals["time"], self.time_constant)
 
     def settled(self) -> Self:
         """All of the output lags, by as much as has the same slope."""
@@ -108,7 +107,7 @@ class Bandwidth(Effect):
         """Time constants from a part of the sample interval to many."""
         if not resolved(signals):
             return []
-        return [cls(time_constant=t) for t in _interval(signals) * np.geomspace(SHORTEST, LONGEST, STEPS)]
+        return [cls(time_constant=t) for t in interval(signals) * np.geomspace(SHORTEST, LONGEST, STEPS)]
 
 
 class OutputAxisAcceleration(Effect):
@@ -134,7 +133,8 @@ class OutputAxisAcceleration(Effect):
         return [cls()] if resolved(signals, "rate_output") else []
 
 
-def _interval(signals: Signals) -> float:
+def interval(signals: Signals) -> float:
+    """The usual step in time, s."""
     step = np.diff(np.asarray(signals["time"]))
     return float(np.median(step[step > 0]))
 
@@ -142,12 +142,18 @@ def _interval(signals: Signals) -> float:
 def resolved(signals: Signals, name: str = "rate") -> bool:
     """Whether a rate changes from sample to sample in a way that tells what it does between them."""
     step = np.diff(np.asarray(signals["time"]))
-    within = (step > 0) & (step <= GAP * _interval(signals))
+    within = (step > 0) & (step <= GAP * interval(signals))
     change, pairs = np.diff(np.asarray(signals[name])), within[1:] & within[:-1]
     one, next_one = change[:-1][pairs], change[1:][pairs]
     if not len(one) or not (np.ptp(one) > 0 and np.ptp(next_one) > 0):
         return False
     return bool(np.corrcoef(one, next_one)[0, 1] > RESOLVED)
+
+
+def remembered(time: Float[Array, " sample"], time_constant: Float[Array, ""]) -> Bool[Array, " sample"]:
+    """Samples at which a lag has not forgotten what was before the stretch."""
+    clock, first, _ = _clock(time)
+    return clock - clock[first] < FORGOTTEN * time_constant
 
 
 def _usual(time: Float[Array, " sample"]) -> Float[Array, ""]:
@@ -240,10 +246,36 @@ def lag(
     # A straight line less ½ d³ω/dt³ s(h − s) at s in a step h.
     drive += 0.5 * time_constant**2 * (1.0 + decay - 2.0 * mean) * jnp.diff(bending, prepend=bending[:1])
     decay, drive = jnp.where(begins, 0.0, decay), jnp.where(begins, start, drive)
+    return jax.lax.scan(_followed, jnp.zeros(()), (decay, drive))[1]
 
-    def follow(d, now):
-        d = now[0] * d + now[1]
-        return d, d
 
-    # Sample by sample: an associative scan takes three times as long to compile, and longer to run.
-    return jax.lax.scan(follow, jnp.zeros(()), (decay, drive))[1]
+@jax.jit
+def rate_behind(
+    time: Float[Array, " sample"],
+    values: Float[Array, " sample"],
+    rate: Float[Array, " sample"],
+    time_constant: Float[Array, ""],
+) -> Float[Array, " sample"]:
+    """Rate of what follows measured values through a first-order lag; below zero, of what they follow so.
+
+    τ dy/dt + y = r with the values' rate r on a line between samples, and its mean in gaps; each run begins with y = r.
+    """
+    clock, _, _ = _clock(time)
+    usual = _usual(time)
+    begins = jnp.concatenate([jnp.ones(1, bool), jnp.diff(time) <= 0])
+    step = jnp.diff(clock, prepend=clock[0] - 1.0)
+    tau = jnp.maximum(time_constant, 1e-3 * usual)
+    decay = jnp.exp(-step / tau)
+    mean = tau / step * (1.0 - decay)
+    before = jnp.concatenate([rate[:1], rate[:-1]])
+    through = (1.0 - decay) * jnp.diff(values, prepend=values[:1]) / step
+    drive = jnp.where(step > GAP * usual, through, (mean - decay) * before + (1.0 - mean) * rate)
+    decay, drive = jnp.where(begins, 0.0, decay), jnp.where(begins, rate, drive)
+    late = jax.lax.scan(_followed, jnp.zeros(()), (decay, drive))[1]
+    return jnp.where(time_constant > 0, late, rate - time_constant * slope(time, rate))
+
+
+# Sample by sample: an associative scan takes three times as long to compile, and longer to run.
+def _followed(y: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
+    y = now[0] * y + now[1]
+    return y, y

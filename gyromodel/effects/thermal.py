@@ -10,14 +10,17 @@ from typing import Self
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from gyromodel._checks import thermometers
 from gyromodel.effects._base import Effect, Signals, parameter, stack
 from gyromodel.effects._shapes import POWER_SCALE, OverTemperature, check_curve, curve_columns, curve_forms
+from gyromodel.effects.dynamics import interval, rate_behind, remembered, resolved
 
 # Time constants after which nothing of a warm-up is left.
 LONG_OVER = 12.0
+# The longest lag of a coil that is searched, as a part of the run, and the ratio of one to the next.
+LONGEST, NEXT = 0.1, 1.7
 
 
 class BiasTemperature(OverTemperature):
@@ -65,37 +68,90 @@ class BiasTemperatureCurve(OverTemperature):
 
 
 class BiasTemperatureRate(Effect):
-    """E += D_Ṫ dT/dt: the Shupe effect."""
+    """E += D_Ṫ dT/dt: the Shupe effect; with a lag, of a coil that follows the thermometer through one.
+
+    Of several lags, each delays a part of it: E += D_Ṫ L_0 + Σ D_k (L_k − L_0), L_k the rate dT/dt behind the lag k, so
+    that D_Ṫ is always the bias on a steady ramp. A lag below zero says that the thermometer is later than the coil.
+    """
 
     id = "bias_temperature_rate"
     site = "rate"
     needs = ("temperature",)
     cause = "A temperature front crossing the fiber coil shifts the two counter-propagating phases unequally."
     test = "Two ramp speeds: this error grows with the speed, thermal hysteresis does not."
+    supersedes = ("bias_temperature_rate",)
 
     coefficient: Float[Array, ""] = parameter("deg/h/(degC/s)", 1000.0, "bias per unit of temperature rate")
+    part: Float[Array, " part"] = parameter("deg/h/(degC/s)", 1000.0, "what of it has each further lag", default=())
+    lag: Float[Array, " lag"] = parameter("s", 60.0, "how late the coil is", linear=False, default=())
+
+    def __check_init__(self) -> None:
+        if np.size(self.part) != max(np.size(self.lag) - 1, 0):
+            raise ValueError("part takes a value for each lag after the first")
+
+    @property
+    def remembers(self) -> bool:
+        """Where it lags."""
+        return np.size(self.lag) > 0
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
-        """dT/dt of the smoothed thermometer."""
-        return stack(signals["temperature_rate"])
+        """dT/dt of the smoothed thermometer behind the first lag, then what each other lag changes in that."""
+        own = signals["time"], signals["temperature"], signals["temperature_rate"]
+        late = [rate_behind(*own, lag) for lag in self.lag] or [signals["temperature_rate"]]
+        return stack(late[0], *(other - late[0] for other in late[1:]))
+
+    def unknown(self, signals: Signals) -> Bool[Array, " sample"]:
+        """The first time constants of a lag, as only a steady ramp before them is allowed for."""
+        return remembered(signals["time"], jnp.max(self.lag)) if self.remembers else super().unknown(signals)
+
+    def joined(self, held: Effect) -> Self:
+        """The lags of both, none being a lag of zero where the other has any; of a special case, its own."""
+        if not held.remembers:
+            return self
+        more = () if held.label != self.label else self.lag if self.remembers else (0.0,)
+        lags = (*held.lag, *more)  # type: ignore[attr-defined]
+        return dataclasses.replace(self, lag=lags, part=np.zeros(len(lags) - 1))
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """Itself, and with lags from the sample interval to a part of the run where the rate is followed so closely."""
+        shortest = interval(signals)
+        longest = LONGEST * float(np.ptp(np.asarray(signals["time_on"])))
+        if longest < shortest or not resolved(signals, "temperature_rate"):
+            return [cls()]
+        lags = np.geomspace(shortest, longest, 1 + int(np.log(longest / shortest) / np.log(NEXT)))
+        return [cls(lag=lag) for lag in [(), *lags[:, None]]]
 
 
-class BiasTemperatureProduct(OverTemperature):
-    """E += D (T − T0) dT/dt: a Shupe effect that changes with temperature."""
+class BiasTemperatureProduct(OverTemperature, BiasTemperatureRate):
+    """E += (D (T − T0) + D_0) dT/dt: a Shupe effect that changes with temperature, with lags like the Shupe effect.
+
+    A model without D_0 has it zero at T0; the search estimates where it is zero.
+    """
 
     id = "bias_temperature_product"
-    site = "rate"
-    needs = ("temperature",)
     cause = (
         "The fiber's thermal coefficients change with temperature, and its response to a temperature front with them."
     )
     test = "The same ramp at a low and at a high temperature: the Shupe effect is the same in both, this is not."
+    supersedes = ("bias_temperature_rate", "bias_temperature_product")
 
     coefficient: Float[Array, ""] = parameter("deg/h/(degC^2/s)", 30.0, "change of the Shupe coefficient per degree")
+    at_reference: Float[Array, " reference"] = parameter(
+        "deg/h/(degC/s)", 1000.0, "the Shupe coefficient at the reference temperature", default=()
+    )
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
-        """(T − T0) dT/dt of the smoothed thermometer."""
-        return stack((signals["temperature"] - self.reference) * signals["temperature_rate"])
+        """(T − T0) dT/dt, what each further lag changes in dT/dt, and dT/dt if it is not zero at T0."""
+        late = super().columns(signals)
+        product = (signals["temperature"] - self.reference) * late[:, 0]
+        return jnp.column_stack([product, late[:, 1:], late[:, : np.size(self.at_reference)]])
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """With lags as the Shupe effect has them, and zero at any temperature."""
+        forms = (dataclasses.replace(form, at_reference=np.zeros(1)) for form in super().candidates(signals))
+        return [form.prepared(signals) for form in forms]
 
 
 class TemperatureLag(OverTemperature):

@@ -112,10 +112,10 @@ def _lacks(causes: Sequence[Cause]) -> str:
 
 
 def _with_size(cause: Cause) -> str:
-    """The cause with its size; a curve of many coefficients is named without them."""
+    """The cause with its size; of many parameters with its one coefficient, or, as a curve has several, without."""
     values = [p for p in cause.parameters if math.isfinite(p.value) and p.std != 0.0]
     if any("[" in p.name for p in values):
-        return phrase(cause.effect)
+        values = [p for p in values if p.name == "coefficient"]
     if len(values) == 1:
         return f"{phrase(cause.effect)} of {with_uncertainty(values[0].value, values[0].std, values[0].unit)}"
     sizes = [f"{spoken(p.name)} {with_uncertainty(p.value, p.std, p.unit)}" for p in values]
