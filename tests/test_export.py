@@ -30,7 +30,7 @@ from gyromodel.units import factor, internal_unit
 from tests.test_c_code import CC, STRICT
 
 ROWS = 150
-REMEMBERING = sorted(name for name, kind in CATALOGUE.items() if kind.remembers)
+REMEMBERING = sorted(name for name, kind in CATALOGUE.items() if kind.remembers is True)
 PLATFORM = sorted(name for name, kind in CATALOGUE.items() if kind.domain == "platform")
 LABELS = [*sorted(set(CATALOGUE) - {"bias_column", "scale_factor", *REMEMBERING, *PLATFORM}), "bias_supply_voltage"]
 # Biases that depend on no rate add up, and are compiled several together.
@@ -199,6 +199,12 @@ def test_effects_of_neighbouring_samples_are_refused(label: str):
     effect = make_effect(label)
     with pytest.raises(ModelError, match=f"{label} cannot be exported to C: it looks at other samples"):
         export_calibration(Calibration(GyroModel((effect,))), "c")
+
+
+def test_a_shupe_effect_with_a_lag_is_refused():
+    lagging = GyroModel((BiasTemperatureRate(lag=(60.0,)),))
+    with pytest.raises(ModelError, match="bias_temperature_rate cannot be exported to C: it looks at other samples"):
+        export_calibration(Calibration(lagging), "c")
 
 
 def test_columns_that_c_cannot_tell_apart_are_refused():

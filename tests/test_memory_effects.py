@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,12 +13,14 @@ import gyromodel as gm
 from gyromodel.compensation import compensate
 from gyromodel.diagnosis._variance import steps_of_output, stretch_still
 from gyromodel.effects.memory import BiasThermalHysteresis
-from gyromodel.effects.thermal import TemperatureLag
+from gyromodel.effects.thermal import BiasTemperatureProduct, BiasTemperatureRate, TemperatureLag
 from gyromodel.estimate import Calibration
 from gyromodel.model import GyroModel, ModelError, make_effect
+from gyromodel.model_files import read_model, write_model
 from gyromodel.numerics.play import play
 from tests.truth import study
 from tests.truth.designs import DESIGNS, Design
+from tests.truth.effects import SHAPES
 from tests.truth.memory import bias_thermal_hysteresis, clipped, dragged, late, rounded, with_late_thermometer
 
 
@@ -96,7 +99,6 @@ def lagging(rng: np.random.Generator, kind: str) -> tuple[gm.Campaign, float]:
     design = DESIGNS["static_cycle"](rng)
     tau = rng.uniform(100.0, 300.0)
     design = with_late_thermometer(design, tau, rng)
-    # Were its vertex at the mean temperature, a late parabola would be the product of temperature and its rate.
     coil = design.true["coil"] - np.quantile(design.true["coil"], 0.25)
     wrong = coil if kind == "line" else coil**2 / 20
     return campaign_of(design, wrong + rng.standard_normal(len(coil))), tau
@@ -105,7 +107,9 @@ def lagging(rng: np.random.Generator, kind: str) -> tuple[gm.Campaign, float]:
 def test_a_late_thermometer_under_a_curved_bias_is_named_with_its_delay():
     campaign, tau = lagging(np.random.default_rng(EXAMPLE), "parabola")
     found = gm.diagnose(campaign, gm.model_from_effects(["bias", "bias_temperature_curve"]), hold_out=False)
-    assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["temperature_lag"])
+    # But for a twentieth of it, a late parabola is a Shupe effect that changes with temperature.
+    assert found.causes[0].effect == "temperature_lag"
+    assert set(found.credible_set) <= {"temperature_lag", "bias_temperature_product"}
     delay = next(p for p in found.causes[0].parameters if p.name == "time_constant")
     assert delay.value == pytest.approx(tau, abs=5 * delay.std)
     assert set(found.extended.model.labels) == {"bias", "temperature_lag"}
@@ -145,6 +149,70 @@ def test_a_lag_of_nothing_is_not_testable(rng: np.random.Generator):
     grown = TemperatureLag.continuing([curve])
     assert grown is not None
     assert np.array_equal(grown.contribution(signals), curve.contribution(signals))
+
+
+@pytest.mark.parametrize("lags", [(150.0,), (0.0, 400.0), (-30.0,)])
+def test_a_coil_follows_the_thermometer_through_its_lags(lags: tuple[float, ...], rng: np.random.Generator):
+    """Against a fine integration; where nothing was recorded the temperature changes evenly."""
+    time = np.concatenate([np.arange(0.0, 3000.0, 10.0), np.arange(3600.0, 6000.0, 10.0)])
+    rate = 0.02 * np.interp(time, [0, 500, 900, 2000, 2400, 4000, 4300, 6000], [0, 0, 1, 1, -1, -1, 0, 0])
+    temperature = 20 + np.concatenate([[0.0], np.cumsum(0.5 * np.diff(time) * (rate[1:] + rate[:-1]))])
+    fine = np.arange(0.0, 6000.0, 0.1)
+    drive = np.interp(fine, time, rate)
+    gap = (fine > 2990.0) & (fine < 3600.0)
+    drive[gap] = (temperature[300] - temperature[299]) / 610.0
+    expected = []
+    for lag in lags:
+        y, late = drive[0], np.empty_like(fine)
+        for i, r in enumerate(drive):
+            y = r if lag <= 0 else y + 0.1 / lag * (r - y)
+            late[i] = y
+        ahead = np.gradient(drive, fine) * max(-lag, 0.0)
+        expected.append(np.interp(time, fine, late + ahead))
+    signals = {"time": time, "temperature": temperature, "temperature_rate": rate}
+    signals = {name: jnp.asarray(values) for name, values in signals.items()}
+    parts = rng.normal(size=len(lags) - 1)
+    effect = BiasTemperatureRate(coefficient=2.0, part=parts, lag=lags)
+    truth = 2.0 * expected[0] + sum(p * (e - expected[0]) for p, e in zip(parts, expected[1:], strict=True))
+    # A slope is not known to a sample where it jumps.
+    smooth = np.ones(len(time), bool) if min(lags) >= 0 else np.abs(np.gradient(np.gradient(rate))) < 1e-9
+    found = np.asarray(effect.contribution(signals))
+    assert found[smooth] == pytest.approx(truth[smooth], abs=3e-3 * np.abs(truth).max())
+    product = BiasTemperatureProduct(coefficient=0.3, at_reference=[2.0], part=parts, lag=lags, reference=20.0)
+    truth += 0.3 * (temperature - 20.0) * expected[0]
+    assert np.asarray(product.contribution(signals))[smooth] == pytest.approx(
+        truth[smooth], abs=3e-3 * np.abs(truth).max()
+    )
+
+
+@pytest.mark.parametrize("effect", ["bias_temperature_rate", "bias_temperature_product"])
+@pytest.mark.parametrize("steps", [8.0, 24.0])
+def test_a_coil_late_by_many_samples_has_no_other_name(effect: str, steps: float, monkeypatch: pytest.MonkeyPatch):
+    """A strong Shupe effect of a coil that heat diffuses into: what its lag leaves must not be named as well."""
+    monkeypatch.setitem(SHAPES, effect, lambda design, rng: {"tau": steps * design.step})
+    truth = study.build(study.Case(EXAMPLE, "static_cycle", "flicker", effect, 40.0))
+    campaign = gm.Campaign(truth.columns, truth.units, truth.metadata)
+    found = gm.diagnose(campaign, gm.model_from_effects(list(truth.truth.baseline)), hold_out=False)
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", [effect])
+    sizes = {p.name: p for p in found.causes[0].parameters}
+    assert sizes["coefficient"].value == pytest.approx(
+        truth.truth.amplitude / np.deg2rad(1 / 3600), abs=6 * sizes["coefficient"].std
+    )
+    if effect == "bias_temperature_rate" and "lag" in sizes:
+        # On a steady ramp the mean of a slab is a third of the diffusion time behind its face.
+        assert 0.2 < sizes["lag"].value / (steps * truth.design.step) < 0.6
+
+
+def test_a_lag_of_a_coil_is_kept_in_the_model_file(tmp_path):
+    model = GyroModel((BiasTemperatureProduct(coefficient=0.3, at_reference=[2.0], lag=(30.0,), reference=20.0),))
+    write_model(model, tmp_path / "model.yaml")
+    (again,) = read_model(tmp_path / "model.yaml").effects
+    assert eqx.tree_equal(again, model.effects[0], rtol=1e-12)
+
+
+def test_parts_need_lags():
+    with pytest.raises(ValueError, match="part takes a value for each lag after the first"):
+        BiasTemperatureRate(part=[1.0])
 
 
 def test_compensate_refuses_a_memory_of_rates():

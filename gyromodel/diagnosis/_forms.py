@@ -31,6 +31,8 @@ LINE_MARGIN = 8.0
 # Harmonics of twice a ramp, the evidence (nats) of a higher one by itself with the search paid for, and by how many
 # steps of the record's resolution it may not be off: of 33 shares of that, the middle ones.
 HARMONICS, HARMONIC_MARGIN, DETUNED, MIDDLE = 256, 4.0, 2.0, range(13, 20)
+# A fit with a gain smaller than this part of the simulation's is none.
+LEAST_GAIN = 0.01
 # Part of the samples that may be given up because an effect does not know what was before them.
 MOST_UNKNOWN = 0.25
 
@@ -60,9 +62,15 @@ def addition(
         effect = _periodic([*lines_of(estimate.model), *_lines(scanner, ranking, estimate.model)])
     for held in estimate.model.effects:
         effect = effect.joined(held) if held.label in effect.supersedes else effect
-    effect = _solved(scanner, estimate, effect, ranking.best_cell(name), pulses).settled()
+    apart = tuple({*pulses, *not_known(scanner, effect)})
+    effect = _solved(scanner, estimate, effect, ranking.best_cell(name), apart).settled()
+    return effect, not_known(scanner, effect)
+
+
+def not_known(scanner: Scanner, effect: Effect) -> tuple[int, ...]:
+    """The rows to be given up because an effect does not know what was before them, if they are few enough."""
     rows = np.flatnonzero(scanner.present & np.asarray(effect.unknown(scanner.record.signals)))
-    return effect, tuple(map(int, rows)) if len(rows) < MOST_UNKNOWN * scanner.present.sum() else ()
+    return tuple(map(int, rows)) if len(rows) < MOST_UNKNOWN * scanner.present.sum() else ()
 
 
 def _with_harmonics(
@@ -194,7 +202,10 @@ def _coefficients(
     norm = np.linalg.norm(w[:, :-1], axis=0)
     norm[norm == 0] = 1.0
     solution = np.linalg.lstsq(w[:, :-1] / norm, w[:, -1], rcond=1e-9)[0] / norm
-    return jnp.asarray(solution[-columns.shape[1] :])
+    own = model.vector()
+    # Beside what was missing, the gain may be another, in proportion to which the columns are.
+    gain = model.with_vector(own + solution[: len(own)]).gain() / model.gain()
+    return jnp.asarray(solution[-columns.shape[1] :]) / jnp.where(jnp.abs(gain) > LEAST_GAIN, gain, 1.0)
 
 
 def _whitened(

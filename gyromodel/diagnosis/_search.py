@@ -26,7 +26,7 @@ MAXIMUM_ROUNDS = 12
 MAXIMUM_STEPS = 3
 # A function of time alone must beat a random walk by this much in one run: no real slow noise is exactly a random walk.
 TIME_MARGIN = 15.0
-# The lead (nats) under which what was found grows before anything else is added: by less, nothing is named.
+# The lead (nats) that a further cause must have over more of one found before: with less, neither is likely enough.
 DOUBT = 3.0
 # Nats by which a cause that no catalogue lists must do better: it is rarer than one that does.
 UNLISTED = 1.0
@@ -69,7 +69,9 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
         lines = ranking.statistic.get("bias_periodic", -np.inf)
         remains = "bias_periodic" if full and lines >= threshold else ""
         name, score = ranking.best(drivers=False, but=("bias_periodic" if full else "", "" if path else avoid))
-        for more in (f.name for f in path if f.effect is not None and f.name in f.effect.supersedes and not f.effect.scan):
+        for more in (
+            f.name for f in path if f.effect is not None and f.name in f.effect.supersedes and not f.effect.scan
+        ):
             # What was found may have more to it: to a further cause that hardly leads, it is no rival to be ruled out.
             if ranking.statistic.get(more, -np.inf) > score - DOUBT:
                 name, score = more, ranking.statistic[more]
@@ -86,8 +88,7 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
         jumps = [i for i, f in enumerate(path) if f.name == "bias_step"]
         if name == "bias_step" and len(jumps) >= MAXIMUM_STEPS:
             return _before(jumps[0], path, estimates)
-        step = steps.step(path, estimate, ranking, name)
-        after = steps.fit(standing([*path, step]))
+        step, after = steps.add(path, steps.step(path, estimate, ranking, name))
         small = unresolved(after, step, scanner.step) if after is not None else ""
         if after is None or small:
             remains = name

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gyromodel.diagnosis._forms import addition
+from gyromodel.diagnosis._forms import addition, not_known
 from gyromodel.diagnosis._ranking import Ranking, is_noise, rank_where_it_matters
 from gyromodel.diagnosis._scan import CLEARLY, Scanner
 from gyromodel.effects import Effect
@@ -40,6 +40,11 @@ class Found:
     def frees_noise(self) -> bool:
         """Whether it says that the stated noise lacks something, so that the noise is estimated from here on."""
         return is_noise(self.name)
+
+    @property
+    def grows(self) -> bool:
+        """Whether there may be more to it than this form; each further line is a cause of its own."""
+        return self.effect is not None and self.name in self.effect.supersedes and not self.effect.scan
 
     @property
     def points(self) -> tuple[int, ...]:
@@ -97,10 +102,12 @@ class Steps:
         """
         ranking = rank_where_it_matters(self._seen(estimate), estimate, rows_of(found))
         (name, score), driver = ranking.best(drivers=False), ranking.best(drivers=True)[1]
-        if BETWEEN * score < EXCHANGE or not name or not self.scanner.bank.forms(name):
+        if BETWEEN * score < EXCHANGE or not name or not (name in ranking.tangents or self.scanner.bank.forms(name)):
             return ranking
         least = (1.0 - BETWEEN) * ranking.explained(name)
         near = {k for k in ranking.statistic if self._has_shape(k) and ranking.explained(k) >= least}
+        # What continues an effect is ranked by its slope alone, which may lose most of it.
+        near |= {k for k in ranking.tangents if ranking.statistic.get(k, -np.inf) > 0.5 * score}
         if not near - {name} and (name not in near or driver < score):
             return ranking
         each = [self.step(found, estimate, ranking, k) for k in {name, *near}]
@@ -136,6 +143,17 @@ class Steps:
         """The search without the samples at which the output ends: of anything more they tell nothing."""
         ended = estimate.model.ended(self.scanner.record.signals)[: self.scanner.record.rows]
         return self.scanner.without(np.flatnonzero(ended), self.scanner.only_cells) if ended.any() else self.scanner
+
+    def add(self, found: Sequence[Found], step: Found) -> tuple[Found, Estimate | None]:
+        """A further step and the fit with it, without the samples that the effect as fitted does not know."""
+        after = self.fit(standing([*found, step]))
+        if after is None or step.effect is None or step.effect.label not in after.model.labels:
+            return step, after
+        rows = not_known(self.scanner, after.model.effects[after.model.labels.index(step.effect.label)])
+        if rows == step.rows:
+            return step, after
+        step = replace(step, rows=rows)
+        return step, self.fit(standing([*found, step]))
 
     def all_but(self, found: Sequence[Found], i: int) -> tuple[Estimate, Ranking] | None:
         """The fit with everything found except item i, and all candidates beside it; none where that fit fails."""

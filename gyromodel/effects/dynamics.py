@@ -23,7 +23,7 @@ CONTINUED = 2.0
 # Time constants after which a lag has forgotten where it began.
 FORGOTTEN = 5.0
 # Delays and lags searched, in sample intervals: where only their product with the slope shows, to many.
-SHORTEST, LONGEST, STEPS = 0.05, 16.0, 40
+SHORTEST, LONGEST, STEPS = 0.05, 64.0, 48
 
 
 class TimeDelay(Effect):

@@ -96,8 +96,8 @@ class BiasTemperatureRate(Effect):
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """dT/dt of the smoothed thermometer behind the first lag, then what each other lag changes in that."""
-        own = signals["time"], signals["temperature"], signals["temperature_rate"]
-        late = [rate_behind(*own, lag) for lag in self.lag] or [signals["temperature_rate"]]
+        rate = signals["temperature_rate"]
+        late = [rate_behind(signals["time"], signals["temperature"], rate, lag) for lag in self.lag] or [rate]
         return stack(late[0], *(other - late[0] for other in late[1:]))
 
     def unknown(self, signals: Signals) -> Bool[Array, " sample"]:
@@ -149,9 +149,9 @@ class BiasTemperatureProduct(OverTemperature, BiasTemperatureRate):
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
-        """With lags as the Shupe effect has them, and zero at any temperature."""
-        forms = (dataclasses.replace(form, at_reference=np.zeros(1)) for form in super().candidates(signals))
-        return [form.prepared(signals) for form in forms]
+        """Zero at the mean temperature, and at any, then with lags as the Shupe effect has them."""
+        anywhere = [dataclasses.replace(form, at_reference=np.zeros(1)) for form in super().candidates(signals)]
+        return [form.prepared(signals) for form in [cls(), *anywhere]]
 
 
 class TemperatureLag(OverTemperature):

@@ -110,7 +110,7 @@ def fit_record(
     white = NoiseRatios(jnp.zeros(()), jnp.zeros(()))
     ratios = given if given is not None else white
     filter = filter_of(record, ratios)
-    solution = solve(model, np.asarray(model.vector()), record, filter, solver)
+    solution = solve(model, np.asarray(model.vector()), record, filter, solver, linear_first=True)
     for turn in range(0 if given is not None else 4):
         before = ratios
         now = model.with_vector(jnp.asarray(solution.x))
@@ -175,8 +175,10 @@ whiten_columns = jax.jit(whiten)
 _gram = jax.jit(whitened_gram)
 
 
-def solve(model: GyroModel, x: np.ndarray, record: Record, filter: Filter, solver: Solver) -> Solution:
-    """Minimise the whitened sum of squares."""
+def solve(
+    model: GyroModel, x: np.ndarray, record: Record, filter: Filter, solver: Solver, linear_first: bool = False
+) -> Solution:
+    """Minimise the whitened sum of squares; with `linear_first` in the linear parameters alone, and then in all."""
     output, present = np.asarray(record.signals["output"]), np.asarray(filter.present)
     steady = model.steady_columns(record.signals)
 
@@ -189,11 +191,32 @@ def solve(model: GyroModel, x: np.ndarray, record: Record, filter: Filter, solve
 
     if not len(x):
         return Solution(x, normal(x)[2], 0, True)
+    if linear_first:
+        x = _linear_start(model, x, normal)
     if solver != "optimistix":
         solution = levenberg_marquardt(normal, np.asarray(x), TOLERANCE)
         if solver == "levenberg_marquardt" or (solution.converged and np.isfinite(solution.x).all()):
             return solution
     return optimistix_solution(model, jnp.asarray(x), record.signals, filter)
+
+
+def _linear_start(model: GyroModel, x: np.ndarray, normal: Callable[[np.ndarray], Normal]) -> np.ndarray:
+    """The linear parameters that fit best at the start's shapes, if there are any shapes and it is better.
+
+    A fit without a delay may have a gain of the wrong sign, from which no step in all parameters at once leads back.
+    """
+    slots = model.slots()
+    linear = np.array([slot.linear for slot in slots])
+    if linear.all() or not linear.any():
+        return x
+    gram, slope, cost = normal(x)
+    step = np.zeros_like(x)
+    step[linear] = -np.linalg.lstsq(gram[np.ix_(linear, linear)], slope[linear], rcond=None)[0]
+    # All but the gain are multiplied by it.
+    others = np.array([model.effects[slot.effect].site != "gain" for slot in slots])
+    ratio = float(model.with_vector(jnp.asarray(x + step)).gain() / model.with_vector(jnp.asarray(x)).gain())
+    step[others] /= ratio if ratio else 1.0
+    return x + step if normal(x + step)[2] < cost else x
 
 
 def pad_columns(columns, step: int = 8):
