@@ -72,8 +72,12 @@ class Bank:
         return tuple(dict.fromkeys([b.name for b in self.blocks] + list(self.scans)))
 
     def forms(self, name: str) -> list[Effect]:
-        """The forms of a catalogue effect that are laid out as columns."""
-        return [b.effect for b in self.blocks if b.name == name and b.effect is not None]
+        """The forms of a catalogue effect that are laid out as columns, but those that others grow into."""
+        return [b.effect for b in self.blocks if b.name == name and b.effect is not None and not b.effect.grown]
+
+    def structures(self, name: str) -> int:
+        """How many structures a catalogue effect's forms have."""
+        return len({b.structure for b in self.blocks if b.name == name and b.effect is not None and not b.effect.grown})
 
     def layout(self) -> dict[int, tuple[int, int, int]]:
         """By width: the first block of that width, how many there are, and the first one's first column."""

@@ -74,7 +74,8 @@ def _basis(columns: np.ndarray) -> np.ndarray:
 
 def _forms(effect: Effect, signals: Signals) -> list[Effect]:
     """All forms of an effect that a search would try on some signals; itself if it has no others."""
-    return (list(type(effect).candidates(signals)) if effect.label == effect.id else []) or [effect]
+    forms = type(effect).candidates(signals) if effect.label == effect.id else []
+    return [form for form in forms if not form.grown] or [effect]
 
 
 def nearest(view: View, truths: Sequence[Effect]) -> tuple[float, str, str]:

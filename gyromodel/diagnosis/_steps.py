@@ -19,6 +19,8 @@ NoisePath = Sequence[NoiseRatios]
 
 # Part of what it explains that an effect may lose for a shape that lies between those searched.
 BETWEEN = 0.05
+# Times that the uncertainty of a shape may grow by that of all others.
+ENTANGLED = 300.0
 # By how many nats a candidate must beat another to take its place.
 EXCHANGE = 2.0
 
@@ -79,6 +81,7 @@ class Steps:
         rows = rows_of(found)
         data = self.scanner.record.without(np.array(rows)) if rows else self.scanner.record
         model = replace(model, noise=self.baseline.model.noise if given else {})
+        entangled = None
         for attempt in (model, _shapes_held(model, found)):
             try:
                 # Another solver would be compiled anew for each model, and has rescued none that this one lost.
@@ -91,9 +94,12 @@ class Steps:
                 )
             except EstimateError:
                 continue
-            if not _negative(after, found):
+            if _negative(after, found):
+                continue
+            if not _entangled(after):
                 return after
-        return None
+            entangled = after
+        return entangled
 
     def rank(self, estimate: Estimate, found: Sequence[Found]) -> Ranking:
         """All candidates beside a fit with what was found; by their fits where the shapes searched mislead.
@@ -114,7 +120,8 @@ class Steps:
         # Fits compare on the same data.
         given_up = Found("", None, rows_of(each), ranking)
         fits = {step.name: self.fit(standing([*found, step, given_up])) for step in each}
-        quality = {k: _quality(fit) for k, fit in fits.items() if fit is not None}
+        price = {k: np.log(max(self.scanner.bank.structures(k), 1)) for k in fits}
+        quality = {k: _quality(fit) - price[k] for k, fit in fits.items() if fit is not None}
         before = self.fit([*found, given_up])
         if name not in quality or before is None:
             return ranking
@@ -195,6 +202,13 @@ def _negative(estimate: Estimate, found: Sequence[Found]) -> bool:
             estimate.model.slots(), np.asarray(estimate.model.vector()), estimate.std, strict=True
         )
     )
+
+
+def _entangled(estimate: Estimate) -> bool:
+    """Whether a shape is known only together with others, such as two lags that are almost the same."""
+    shapes = [i for i, slot in enumerate(estimate.model.slots()) if not slot.linear]
+    correlation = estimate.covariance / np.outer(estimate.std, estimate.std)
+    return bool((np.diag(np.linalg.pinv(correlation, hermitian=True))[shapes] > ENTANGLED**2).any())
 
 
 def _shapes_held(model: GyroModel, found: Sequence[Found]) -> GyroModel:

@@ -153,6 +153,8 @@ def judge(
                 continue
         if name in baseline.model.wholly_fixed():
             findings.append(f"{name} is fixed in the simulation at a value that the data contradict: it was set free.")
+        elif step.grows and name in baseline.model.labels:
+            findings.append(f"{name} is in the simulation, but not in this form: the extended model has it whole.")
         if name == "scale_factor":
             findings.append("A scale error of the rate table would look the same: check it against a second reference.")
         close = _close_rival(step, members)

@@ -100,6 +100,11 @@ class Effect(eqx.Module):
         return self.id
 
     @property
+    def grown(self) -> bool:
+        """Whether this is a form that is tried only where the model has the effect in another one."""
+        return False
+
+    @property
     def columns_needed(self) -> tuple[str, ...]:
         """The campaign columns this instance reads."""
         return self.needs

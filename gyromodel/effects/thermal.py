@@ -114,10 +114,13 @@ class BiasTemperatureRate(Effect):
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
-        """Itself, and with lags from the sample interval to a part of the run where the rate is followed so closely."""
+        """Itself, and with lags from the sample interval to a part of the run where the rate is followed so closely.
+
+        Beside a second thermometer a lag is a difference of temperatures, which has effects of its own.
+        """
         shortest = interval(signals)
         longest = LONGEST * float(np.ptp(np.asarray(signals["time_on"])))
-        if longest < shortest or not resolved(signals, "temperature_rate"):
+        if longest < shortest or not resolved(signals, "temperature_rate") or len(thermometers(signals)) > 1:
             return [cls()]
         lags = np.geomspace(shortest, longest, 1 + int(np.log(longest / shortest) / np.log(NEXT)))
         return [cls(lag=lag) for lag in [(), *lags[:, None]]]
@@ -140,6 +143,11 @@ class BiasTemperatureProduct(OverTemperature, BiasTemperatureRate):
     at_reference: Float[Array, " reference"] = parameter(
         "deg/h/(degC/s)", 1000.0, "the Shupe coefficient at the reference temperature", default=()
     )
+
+    @property
+    def grown(self) -> bool:
+        """With a lag: a product of two factors that both may lag imitates too much to begin with."""
+        return self.remembers
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """(T − T0) dT/dt, what each further lag changes in dT/dt, and dT/dt if it is not zero at T0."""
