@@ -211,7 +211,7 @@ BY_HAND = [
         [3.0, 1.3 + 2 * 1.69 + 9.0, -0.3 + 2 * 0.09],
     ),
     (
-        # Absolute temperatures are those of reference times 1, 2 and 1/2; the resistance is e-fold, even and 1/e.
+        # 273.15 K, 546.3 K and half of 273.15 K told; by 0.5/273.15 of 1/273.15 K less, right, and as much more.
         "thermometer_error",
         {
             "bias": ["2 deg/h/degC"],
@@ -225,7 +225,7 @@ BY_HAND = [
             "thermistor_resistance": [1e3 * np.e, 1e3, 1e3 / np.e],
             "rate": [0.0, 0.0, 10 * DEG_H],
         },
-        [2 * 0.5, 2 * 273.15, 12 * (-273.15 / 2 - 0.5 / 4)],
+        [2 * 273.15 * (1 / (1 - 0.5 / 273.15) - 1), 2 * 273.15, 12 * 273.15 * (1 / (2 + 0.5 / 273.15) - 1)],
     ),
     (
         # Play of ±2: 21, 25, 22, 19 and 20 drag along 21, 23, 23, 21 and 21; a new campaign starts afresh.

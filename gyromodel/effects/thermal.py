@@ -151,11 +151,11 @@ class TemperatureLag(OverTemperature):
 
 
 class ThermometerError(OverTemperature):
-    """E += (D_T + 1e-6 ε_T ω)(T + δT − T0), δT = e (T/T0)² ln(R/R0): the law that makes T of a resistance R errs.
+    """E += (D_T + 1e-6 ε_T ω)(U − T0), 1/U = 1/T − e/T0² ln(R/R0): the law that makes T of a resistance R errs.
 
-    It contains bias and scale factor over temperature and equals them for e = 0; T/T0 is of absolute temperatures, R0
-    the resistance at T0. With β' in the place of a thermistor's constant β, e = T0² (1/β' − 1/β). The ripple is the same
-    in bias and scale factor; where only one of them shows it, it may as well be a curve of that one.
+    It contains bias and scale factor over temperature and equals them for e = 0; reciprocals are of absolute
+    temperatures, R0 is the resistance at T0. With β' in the place of a thermistor's constant β, e = T0² (1/β' − 1/β). The
+    ripple is the same in bias and scale factor; where only one of them shows it, it may as well be a curve of that one.
     """
 
     id = "thermometer_error"
@@ -190,11 +190,11 @@ class ThermometerError(OverTemperature):
         return eqx.tree_at(lambda e: e.resistance, effect, signals["thermistor_resistance"][nearest])
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
-        """T + δT − T0, and that times the rate."""
-        absolute = (signals["temperature"] + ZERO_CELSIUS) / (self.reference + ZERO_CELSIUS)
-        turn = jnp.log(signals["thermistor_resistance"] / self.resistance)
-        ahead = signals["temperature"] - self.reference + self.error * absolute**2 * turn
-        return stack(*([ahead] * self.bias.size), *([signals["rate"] * ahead] if self.scale.size else []))
+        """U − T0, and that times the rate."""
+        told, reference = signals["temperature"] + ZERO_CELSIUS, self.reference + ZERO_CELSIUS
+        shift = self.error / reference**2 * jnp.log(signals["thermistor_resistance"] / self.resistance)
+        right = signals["temperature"] - self.reference + told * (1.0 / (1.0 - told * shift) - 1.0)
+        return stack(*([right] * self.bias.size), *([signals["rate"] * right] if self.scale.size else []))
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
@@ -204,9 +204,7 @@ class ThermometerError(OverTemperature):
     @classmethod
     def continuing(cls, effects: Sequence[Effect], signals: Signals) -> Self | None:
         """The model's own bias and scale factor over temperature, without an error yet, where T follows from R."""
-        bias, scale = (
-            [e for e in effects if isinstance(e, kind)] for kind in (BiasTemperature, ScaleTemperature)
-        )
+        bias, scale = ([e for e in effects if isinstance(e, kind)] for kind in (BiasTemperature, ScaleTemperature))
         if not bias + scale or not _follows(signals["temperature"], signals["thermistor_resistance"]):
             return None
         grown = cls(
