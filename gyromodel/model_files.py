@@ -31,7 +31,7 @@ GAIN_UNITS = ("count/deg", "count/(deg/s)", "bit/deg", "bit/(deg/s)", "V/(deg/s)
 FIT_KEYS = ("degrees_of_freedom", "validity", "data_hash", "covariance")
 # By how much a factor's square may differ from the covariance, of its size.
 SAME_COVARIANCE = 1e-6
-SETTING_UNITS = {"reference": "degC", "full_rate": "deg/s", "lowest": "deg/s"}
+SETTING_UNITS = {"reference": "degC", "full_rate": "deg/s", "lowest": "deg/s", "resistance": "ohm"}
 
 
 def read_model(path: str | Path) -> GyroModel:

@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 
 from gyromodel._checks import CampaignError
 from gyromodel.estimate import EstimateError, FunctionFit, fit_function
+from gyromodel.units import ZERO_CELSIUS
 
-ZERO_CELSIUS = 273.15  # K
 ORDER = 4
 # From the solution of the first two terms, five steps reach rounding over any range that a thermistor serves.
 NEWTON_STEPS = 6

@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+ZERO_CELSIUS = 273.15  # K
+
 # pint's definition format; the first unit of a dimension is the internal one.
 _DEFINITIONS = """
 pico- = 1e-12

@@ -40,6 +40,7 @@ def signals_of(rng: np.random.Generator) -> dict[str, jax.Array]:
         "temperature_rate": 0.05 * np.cos(time / 300),
         "temperature_coil": 20 + 14 * np.sin(time / 300 - 0.2),
         "temperature_coil_rate": 0.045 * np.cos(time / 300 - 0.2),
+        "thermistor_resistance": 1e4 * np.exp(-0.6 * np.sin(time / 300)),
         "feedback_ramp": np.floor(32768 * (0.021 * np.arange(ROWS) % 1.0)),
         "run": np.repeat([3.0, 1.0, 4.0], [20, 20, ROWS - 40]),
         "pressure": 1e5 + 100 * rng.standard_normal(ROWS),
@@ -208,6 +209,23 @@ BY_HAND = [
         # three degrees ahead: 30, 33 and 17 degC
         {"temperature": [27.0, 30.0, 20.0], "temperature_rate": [0.01, 0.01, -0.01]},
         [3.0, 1.3 + 2 * 1.69 + 9.0, -0.3 + 2 * 0.09],
+    ),
+    (
+        # 273.15 K, 546.3 K and half of 273.15 K told; by 0.5/273.15 of 1/273.15 K less, right, and as much more.
+        "thermometer_error",
+        {
+            "bias": ["2 deg/h/degC"],
+            "scale": ["1e6 ppm/degC"],
+            "error": "0.5 degC",
+            "reference": "0 degC",
+            "resistance": "1 kohm",
+        },
+        {
+            "temperature": [0.0, 273.15, -273.15 / 2],
+            "thermistor_resistance": [1e3 * np.e, 1e3, 1e3 / np.e],
+            "rate": [0.0, 0.0, 10 * DEG_H],
+        },
+        [2 * 273.15 * (1 / (1 - 0.5 / 273.15) - 1), 2 * 273.15, 12 * 273.15 * (1 / (2 + 0.5 / 273.15) - 1)],
     ),
     (
         # Play of ±2: 21, 25, 22, 19 and 20 drag along 21, 23, 23, 21 and 21; a new campaign starts afresh.

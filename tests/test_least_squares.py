@@ -224,6 +224,24 @@ def test_the_bottom_of_a_kink_is_a_minimum():
     assert found.x == pytest.approx([0.0], abs=1e-6)
 
 
+def test_the_place_of_a_hinge_is_found_between_samples_that_are_kinks_of_the_cost(rng: np.random.Generator):
+    """Steep on one side of a sample and nearly flat on the other, where the least cost often is."""
+    x = np.linspace(0.0, 1.0, 300)
+    columns = np.column_stack([np.ones(300), x, np.maximum(x - 0.5, 0.0)])
+    for _ in range(300):
+        data = 2.0 * columns[:, 2] + 0.02 * rng.standard_normal(300)
+
+        def normal(v: np.ndarray, data: np.ndarray = data) -> Normal:
+            j = np.column_stack([np.ones(300), x, np.maximum(x - v[3], 0.0), -v[2] * (x > v[3])])
+            r = j[:, :3] @ v[:3] - data
+            return j.T @ j, j.T @ r, float(r @ r)
+
+        found = levenberg_marquardt(normal, np.array([0.0, 0.0, 1.0, 0.45]), 1e-8)
+        assert found.converged
+        # There is a minimum between most samples: any near the truth will do.
+        assert found.cost <= np.linalg.lstsq(columns, data)[1][0] * 1.01
+
+
 def test_singular_problem_ends_at_the_least_cost_without_moving_far(rng: np.random.Generator):
     """Two equal columns and one of zeros: the cost has a least value, the parameters have none."""
     column = rng.standard_normal(30)

@@ -136,9 +136,9 @@ def test_a_lag_beyond_reach_is_not_put_beside_the_shupe_effect():
 
 
 def test_a_lag_of_nothing_is_not_testable(rng: np.random.Generator):
-    assert TemperatureLag.continuing([make_effect("bias")]) is None
+    assert TemperatureLag.continuing([make_effect("bias")], {}) is None
     curve = make_effect("bias_temperature_curve")
-    grown = TemperatureLag.continuing([curve])
+    grown = TemperatureLag.continuing([curve], {})
     assert grown is not None
     signals = {
         "temperature": jnp.asarray(rng.normal(20, 5, 30)),
@@ -146,7 +146,7 @@ def test_a_lag_of_nothing_is_not_testable(rng: np.random.Generator):
         "time": jnp.zeros(30),
     }
     curve = curve.with_linear(jnp.asarray([1.0, 2.0])).prepared(signals)
-    grown = TemperatureLag.continuing([curve])
+    grown = TemperatureLag.continuing([curve], {})
     assert grown is not None
     assert np.array_equal(grown.contribution(signals), curve.contribution(signals))
 

@@ -280,7 +280,7 @@ def filled() -> list:
     friction = dataclasses.replace(
         make_effect("shaft_friction"), viscous=[0.01, 0.02, 0.03], coulomb=[1e-4, 2e-4, 3e-4], shafts=SHAFTS
     )
-    loop = CATALOGUE["loop_dynamics"].continuing([friction])
+    loop = CATALOGUE["loop_dynamics"].continuing([friction], {})
     tilts = dataclasses.replace(make_effect("gimbal_nonorthogonality"), tilt=1e-5 * np.arange(1.0, 9.0), tilts=TILTS)
     terms = tuple(f"{g}/{k}" for g in ENCODERS for k in (1, 2))
     rings = EncoderHarmonic(1e-5 * np.arange(8.0), -1e-5 * np.arange(8.0), terms)

@@ -14,6 +14,7 @@ from gyromodel.diagnosis._drivers import NOT_DRIVERS
 from gyromodel.effects.geometry import cross_rates
 from gyromodel.units import from_internal
 
+RESISTANCE = "thermistor_resistance"
 # Columns that a test cannot step by themselves.
 NOT_SET = (*NOT_DRIVERS, *COLUMNS, "rate", "rate_spin", "rate_output", "azimuth")
 # Rates (rad/s) up to which the Earth alone turns the gyro, and to which a table turns it about another axis.
@@ -45,7 +46,7 @@ def added_tests(campaign: Campaign) -> Iterator[AddedTest]:
         turned = campaign.columns["azimuth"] + from_internal(np.pi / 2, campaign.units["azimuth"])
         yield AddedTest("Turn the gyro by 90° in azimuth and repeat.", _with(campaign, azimuth=turned))
     columns = campaign.columns
-    kept = {*NOT_SET, *along_axes("rate", columns), *thermometers(columns), *accelerations(columns)}
+    kept = {*NOT_SET, RESISTANCE, *along_axes("rate", columns), *thermometers(columns), *accelerations(columns)}
     for name in campaign.covariates:
         if name in kept or not np.ptp(campaign.columns[name]) > 0:
             continue
@@ -89,7 +90,7 @@ def _turned(campaign: Campaign, cross: list[str]) -> Iterator[AddedTest]:
 
 
 def _thermal(campaign: Campaign) -> Iterator[AddedTest]:
-    """Other histories of temperature; further thermometers follow the first as they do in the campaign."""
+    """Other histories of temperature; further thermometers and a thermistor follow the first as in the campaign."""
     time, values = campaign.si("time"), campaign.columns["temperature"]
     low, high, unit = values.min(), values.max(), campaign.units["temperature"]
     part = (time - time[0]) / np.ptp(time)
@@ -116,6 +117,10 @@ def _thermal(campaign: Campaign) -> Iterator[AddedTest]:
             for name in thermometers(campaign.columns)
             if name != "temperature"
         }
+        if RESISTANCE in campaign.columns:
+            # Its logarithm bends little over temperature.
+            logs = np.log(np.maximum(campaign.columns[RESISTANCE], np.finfo(float).tiny))
+            others[RESISTANCE] = np.exp(np.polynomial.Polynomial.fit(values, logs, 3)(history))
         yield AddedTest(sentence, _with(campaign, temperature=history, **others))
 
 

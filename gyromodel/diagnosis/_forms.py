@@ -38,15 +38,15 @@ MOST_UNKNOWN = 0.25
 
 
 def addition(
-    scanner: Scanner, estimate: Estimate, ranking: Ranking, name: str, pulses: tuple[int, ...]
+    scanner: Scanner, estimate: Estimate, ranking: Ranking, name: str, pulses: tuple[int, ...], form: int | None = None
 ) -> tuple[Effect | None, tuple[int, ...]]:
-    """A named candidate as an effect at its best form, and the rows given up with it.
+    """A named candidate as an effect at its best form, or another, and the rows given up with it.
 
     Rows alone for gross errors; neither for noise that is not stated.
     """
     if is_noise(name):
         return None, ()
-    form, _, _ = ranking.best_form(name)
+    form = ranking.best_form(name)[0] if form is None else form
     if name == "outliers":
         rows = form if isinstance(form, tuple) else (form,)
         return None, tuple(int(r) for r in rows)

@@ -152,7 +152,7 @@ def _at_size(view: View, fitted: GyroModel, names: Sequence[str]) -> list[Effect
         if name in fitted.labels:
             found.append(fitted.effects[fitted.labels.index(name)])
             continue
-        grown = effect_class(name).continuing(view.model.effects)
+        grown = effect_class(name).continuing(view.model.effects, signals)
         if grown is not None:
             column = np.asarray(evaluate(grown, signals)[1][:, -1:]) * float(view.model.gain())
             left = view.rest(column)[:, 0]
@@ -281,7 +281,7 @@ def _sizes(
     whole = {name: view.columns_of(effects, whole=True) for name, effects in forms.items()}
     not_testable = {name.removeprefix(PART_OF): reason for name, reason in bank.not_testable.items()}
     untested = [n for n, reason in not_testable.items() if n in CATALOGUE and reason == CATALOGUE[n].untested]
-    for name in [n for n in untested if CATALOGUE[n].continuing(model.effects) is not None]:
+    for name in [n for n in untested if CATALOGUE[n].continuing(model.effects, record.signals) is not None]:
         not_testable[name] = "continues an effect of the model, at sizes that only data show: it is not sized before"
     for name in list(left):
         pairs = zip(left[name], whole[name], strict=True)

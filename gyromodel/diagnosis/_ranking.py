@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gyromodel._checks import thermometers
+from gyromodel.diagnosis._bank import Bank
 from gyromodel.diagnosis._drivers import RESPONSE_DRIVER
 from gyromodel.diagnosis._evidence import log_sum
 from gyromodel.diagnosis._lines import lines_of
@@ -88,6 +89,16 @@ class Ranking:
     def best_form(self, name: str) -> tuple[int | tuple[int, ...], float, float]:
         """Form, explained sum and dimension of a candidate where it is best."""
         return self.results[self.best_cell(name)].best[name]
+
+    def structures(self, bank: Bank, name: str, share: float) -> list[int]:
+        """The best form of each structure of a candidate that explains a share of what its best form does."""
+        explained, best = self.results[self.best_cell(name)].explained, self.best_form(name)[1]
+        forms: dict[str, int] = {}
+        for i in np.argsort(explained):
+            block = bank.blocks[i]
+            if block.name == name and explained[i] >= share * best:
+                forms[block.structure] = int(i)
+        return list(forms.values())
 
     def explained(self, name: str) -> float:
         """Part of the residual sum of squares that a candidate's best form explains, where it is best."""
@@ -198,8 +209,10 @@ def tangents(scanner: Scanner, model: GyroModel, skip: set[str]) -> dict[str, Ta
     """Candidates that continue effects of a model, where nothing but their absence keeps them from being searched."""
     found = {}
     for name, kind in CATALOGUE.items():
-        effect = kind.continuing(model.effects) if scanner.bank.not_testable.get(name) == kind.untested else None
-        if effect is not None and name not in skip:
+        if name in skip or scanner.bank.not_testable.get(name) != kind.untested:
+            continue
+        effect = kind.continuing(model.effects, scanner.record.signals)
+        if effect is not None:
             found[name] = Tangent(effect, np.asarray(evaluate(effect, scanner.record.signals)[1][:, -1]))
     return found
 

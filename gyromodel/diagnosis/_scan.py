@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 
 import jax.numpy as jnp
@@ -48,7 +48,10 @@ def _libraries() -> ThreadpoolController:
 
 @dataclass
 class CellResult:
-    """One cell's verdict on every candidate, beside its own restricted likelihood."""
+    """One cell's verdict on every candidate, beside its own restricted likelihood.
+
+    `explained`: what each form laid out as columns explains, by its number.
+    """
 
     log_likelihood: float
     rss: float
@@ -56,6 +59,7 @@ class CellResult:
     best: dict[str, tuple[int | tuple[int, ...], float, float]]
     energy: dict[str, np.ndarray]
     peaks: dict[int, float]
+    explained: np.ndarray | None = field(default=None, repr=False)
 
 
 @dataclass
@@ -71,6 +75,7 @@ class Batch:
     best: dict[str, tuple[list, np.ndarray, np.ndarray]]
     energy: dict[str, np.ndarray]
     peaks: dict[int, float]
+    explained: np.ndarray | None = None
 
     def first(self) -> CellResult:
         """The first residual's results as plain numbers."""
@@ -79,7 +84,9 @@ class Batch:
             for name, (form, t, q) in self.best.items()
         }
         evidence = {name: float(v[0]) for name, v in self.evidence.items()}
-        return CellResult(float(self.log_likelihood[0]), float(self.rss[0]), evidence, best, self.energy, self.peaks)
+        log, rss = float(self.log_likelihood[0]), float(self.rss[0])
+        explained = self.explained[:, 0] if self.explained is not None else None
+        return CellResult(log, rss, evidence, best, self.energy, self.peaks, explained)
 
 
 class Scanner:
@@ -305,6 +312,7 @@ class Scanner:
         # A form that loses more columns than the baseline contains is another form in disguise.
         sound = (q_of >= least) & ~self._lost
         energy[~sound] = 0.0
+        batch.explained = np.where(sound[:, None], t_of, 0.0)
         ratio = log_evidence_ratio(t_of, batch.rss, nu, q_of[:, None]) - self._price[:, None]
         ratio = np.where(sound[:, None], ratio, -np.inf)[self._order]
         # Structures compete by their mean over shapes; the best shape of the best structure stands for the name.

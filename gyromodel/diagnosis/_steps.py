@@ -143,8 +143,19 @@ class Steps:
         return len(forms) > 1 and any(not declared.linear for declared in forms[0].declared().values())
 
     def step(self, found: Sequence[Found], estimate: Estimate, ranking: Ranking, name: str) -> Found:
-        """A candidate of a ranking beside what was found, as one more step."""
-        return Found(name, *addition(self._seen(estimate), estimate, ranking, name, rows_of(found)), ranking)
+        """A candidate of a ranking beside what was found, as one more step; of much evidence, in what fits best.
+
+        A hinge between the places searched loses to two hinges around it.
+        """
+        scanner, rows = self._seen(estimate), rows_of(found)
+        forms = [None]
+        if BETWEEN * ranking.statistic.get(name, -np.inf) >= EXCHANGE and self._has_shape(name):
+            forms = ranking.structures(scanner.bank, name, 1.0 - BETWEEN) or forms
+        each = [Found(name, *addition(scanner, estimate, ranking, name, rows, form), ranking) for form in forms]
+        if len(each) < 2:
+            return each[0]
+        fits = [self.fit(standing([*found, step])) for step in each]
+        return max(zip(fits, each, strict=True), key=lambda pair: _quality(pair[0]) if pair[0] else -np.inf)[1]
 
     def _seen(self, estimate: Estimate) -> Scanner:
         """The search without the samples at which the output ends: of anything more they tell nothing."""

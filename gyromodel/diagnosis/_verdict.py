@@ -133,6 +133,14 @@ def judge(
             "not recorded still shows there."
         )
     findings += [line for step in found if (line := _in_campaign(step.effect))]
+    held: dict[str, list[str]] = {}
+    for label, shape in sorted(extended.model.fixed - baseline.model.fixed):
+        held.setdefault(label, []).append(shape)
+    findings += [
+        f"{' and '.join(shapes)} of {label} stayed where the search had put them, as they could not be estimated: the "
+        "other uncertainties are those for just these values."
+        for label, shapes in held.items()
+    ]
     for i, step in enumerate(found):
         ranking, name = selection.left_out.get(i), step.name
         # What grew is judged whole.

@@ -128,7 +128,7 @@ class Effect(eqx.Module):
         return ""
 
     @classmethod
-    def continuing(cls, effects: Sequence[Effect]) -> Self | None:
+    def continuing(cls, effects: Sequence[Effect], signals: Signals) -> Self | None:
         """The effect grown from those of a model, whose sum it is where its last nonlinear parameter is zero.
 
         That parameter is then its amplitude. None where the model has nothing to grow from.

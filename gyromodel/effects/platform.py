@@ -290,7 +290,7 @@ class LoopDynamics(_ThroughLoop):
         return []
 
     @classmethod
-    def continuing(cls, effects: Sequence[Effect]) -> Self | None:
+    def continuing(cls, effects: Sequence[Effect], signals: Signals) -> Self | None:
         """The model's own friction, through the simulated loop."""
         for e in effects:
             if isinstance(e, ShaftFriction) and np.any(np.asarray(e.linear()) != 0):

@@ -62,11 +62,13 @@ def levenberg_marquardt(
         promise = -float(g @ step)
         if promise <= tolerance * cost:
             # Under heavy damping a small promise says nothing: then the residual must be orthogonal to every column, or
-            # the last step, so short that it cost next to nothing, still led up, as where the cost has a kink.
+            # the last step, so short that it cost next to nothing, still led up, as where the cost has a kink. What led
+            # up by more is tried shorter.
             orthogonal = np.all(np.abs(g) <= 1e-6 * scale * np.sqrt(cost))
             converged = bool(damping < 1.0 or orthogonal or worse <= KINK_TOLERANCE * tolerance * cost)
-            # The last step is as good as those before it, and known already.
-            return Solution(x + step if converged else x, cost, iteration, converged)
+            if converged or np.isnan(worse):
+                # The last step is as good as those before it, and known already.
+                return Solution(x + step if converged else x, cost, iteration, converged)
         with np.errstate(over="ignore", invalid="ignore"):  # a step too far is refused below
             a_new, g_new, cost_new = normal(x + step)
         if _finite(a_new, g_new, cost_new) and cost_new <= cost:
@@ -74,14 +76,14 @@ def levenberg_marquardt(
             # Decrease over what the linear model promised: near one, the damping falls (Nielsen 1999, equation 2.4).
             ratio = decrease / (promise + damping * float(np.sum((scale * step) ** 2)))
             x, a, g, cost = x + step, a_new, g_new, cost_new
-            if decrease <= tolerance * cost:
+            if decrease <= tolerance * cost < promise:
                 return Solution(x, cost, iteration, True)
             damping = max(damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), LEAST_DAMPING)
             if ratio < 0.25:
                 damping = max(damping, FIRST_DAMPING)
             growth, worse = 2.0, np.inf
         else:
-            worse = cost_new - cost if np.isfinite(cost_new) else np.inf
+            worse = cost_new - cost if np.isfinite(cost_new) else np.nan
             damping, growth = max(growth * damping, FIRST_DAMPING), 2.0 * growth
     return Solution(x, cost, maximum_iterations, False)
 

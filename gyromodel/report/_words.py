@@ -24,6 +24,7 @@ PHRASES = {
     "bias_temperature_rate": "a temperature-rate bias",
     "bias_temperature_product": "a temperature-rate bias that changes with temperature",
     "temperature_lag": "a thermometer that is late",
+    "thermometer_error": "an error of the thermistor's calibration",
     "bias_thermal_hysteresis": "a thermal hysteresis of the bias",
     "bias_temperature_gradient": "a bias proportional to a temperature difference",
     "bias_temperature_gradient_rate": "a bias proportional to the rate of a temperature difference",
