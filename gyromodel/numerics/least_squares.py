@@ -14,8 +14,9 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 Normal = tuple[np.ndarray, np.ndarray, float]
 
-# Damping relative to the squared column norms: what a singular matrix needs, and what the first refused step gets.
-LEAST_DAMPING, FIRST_DAMPING = 1e-14, 1e-3
+# Damping relative to the squared column norms: what a singular matrix needs, what the first refused step gets, and
+# beyond which steps are shorter than rounding.
+LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-14, 1e-3, 1e16
 # Times the tolerance by which the last refused step at a kink may be above it.
 KINK_TOLERANCE = 10.0
 
@@ -85,7 +86,9 @@ def levenberg_marquardt(
         else:
             worse = cost_new - cost if np.isfinite(cost_new) else np.nan
             damping, growth = max(growth * damping, FIRST_DAMPING), 2.0 * growth
-    return Solution(x, cost, maximum_iterations, False)
+            if damping > MOST_DAMPING:
+                break
+    return Solution(x, cost, iteration, False)
 
 
 def _finite(a: np.ndarray, g: np.ndarray, cost: float) -> bool:
