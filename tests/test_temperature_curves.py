@@ -35,7 +35,7 @@ def test_one_hinge_is_found_as_one_with_an_interval_of_its_place(rng: np.random.
     assert set(sizes) == {"coefficients", "hinges", "breakpoints"}
     for name, truth in (("hinges", 0.05), ("breakpoints", place)):
         value, std = sizes[name]
-        assert 0.0 < std
+        assert std > 0.0
         assert value == pytest.approx(truth, abs=FAR * std)
     assert sizes["breakpoints"][1] < 1.0
 

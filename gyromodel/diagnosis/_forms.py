@@ -38,7 +38,12 @@ MOST_UNKNOWN = 0.25
 
 
 def addition(
-    scanner: Scanner, estimate: Estimate, ranking: Ranking, name: str, pulses: tuple[int, ...], form: int | None = None
+    scanner: Scanner,
+    estimate: Estimate,
+    ranking: Ranking,
+    name: str,
+    pulses: tuple[int, ...],
+    other: int | None = None,
 ) -> tuple[Effect | None, tuple[int, ...]]:
     """A named candidate as an effect at its best form, or another, and the rows given up with it.
 
@@ -46,7 +51,7 @@ def addition(
     """
     if is_noise(name):
         return None, ()
-    form = ranking.best_form(name)[0] if form is None else form
+    form = ranking.best_form(name)[0] if other is None else other
     if name == "outliers":
         rows = form if isinstance(form, tuple) else (form,)
         return None, tuple(int(r) for r in rows)

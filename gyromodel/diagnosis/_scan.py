@@ -59,7 +59,7 @@ class CellResult:
     best: dict[str, tuple[int | tuple[int, ...], float, float]]
     energy: dict[str, np.ndarray]
     peaks: dict[int, float]
-    explained: np.ndarray | None = field(default=None, repr=False)
+    explained: np.ndarray = field(repr=False)
 
 
 @dataclass
@@ -75,7 +75,7 @@ class Batch:
     best: dict[str, tuple[list, np.ndarray, np.ndarray]]
     energy: dict[str, np.ndarray]
     peaks: dict[int, float]
-    explained: np.ndarray | None = None
+    explained: np.ndarray = field(default_factory=lambda: np.zeros((0, 1)), repr=False)
 
     def first(self) -> CellResult:
         """The first residual's results as plain numbers."""
@@ -85,8 +85,7 @@ class Batch:
         }
         evidence = {name: float(v[0]) for name, v in self.evidence.items()}
         log, rss = float(self.log_likelihood[0]), float(self.rss[0])
-        explained = self.explained[:, 0] if self.explained is not None else None
-        return CellResult(log, rss, evidence, best, self.energy, self.peaks, explained)
+        return CellResult(log, rss, evidence, best, self.energy, self.peaks, self.explained[:, 0])
 
 
 class Scanner:

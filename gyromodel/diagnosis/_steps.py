@@ -148,9 +148,9 @@ class Steps:
         A hinge between the places searched loses to two hinges around it.
         """
         scanner, rows = self._seen(estimate), rows_of(found)
-        forms = [None]
+        forms: list[int | None] = [None]
         if BETWEEN * ranking.statistic.get(name, -np.inf) >= EXCHANGE and self._has_shape(name):
-            forms = ranking.structures(scanner.bank, name, 1.0 - BETWEEN) or forms
+            forms = [*ranking.structures(scanner.bank, name, 1.0 - BETWEEN)] or forms
         each = [Found(name, *addition(scanner, estimate, ranking, name, rows, form), ranking) for form in forms]
         if len(each) < 2:
             return each[0]

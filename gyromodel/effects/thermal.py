@@ -218,8 +218,8 @@ class ThermometerError(OverTemperature):
     """E += (D_T + 1e-6 ε_T ω)(U − T0), 1/U = 1/T − e/T0² ln(R/R0): the law that makes T of a resistance R errs.
 
     It contains bias and scale factor over temperature and equals them for e = 0; reciprocals are of absolute
-    temperatures, R0 is the resistance at T0. With β' in the place of a thermistor's constant β, e = T0² (1/β' − 1/β). The
-    ripple is the same in bias and scale factor; where only one of them shows it, it may as well be a curve of that one.
+    temperatures, R0 is the resistance at T0. With β' in the place of a thermistor's constant β, e = T0² (1/β' − 1/β).
+    The ripple is the same in bias and scale factor; where only one of them shows it, it may be a curve of that one.
     """
 
     id = "thermometer_error"
