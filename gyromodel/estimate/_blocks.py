@@ -38,6 +38,17 @@ class Blocks(NamedTuple):
     used: Any
     filter: Filter | None
 
+    def thinnable(self, model: GyroModel) -> bool:
+        """Whether samples may be left out."""
+        return self.filter is None and len(self.weight) >= 4 and not any(e.remembers for e in model.effects)
+
+    def thinned(self) -> Blocks:
+        """One block, of one sample out of as many as there are blocks, by chance, as regular ones may fit a period."""
+        every = self.weight.shape[0]
+        chosen = every * np.arange(BLOCK) + np.random.default_rng(0).integers(every, size=BLOCK)
+        signals, weight = jax.tree.map(lambda v: v.reshape(-1)[chosen][None], (self.signals, self.weight))
+        return Blocks(signals, weight, 1, None)
+
 
 Known = Mapping[int, Rows]
 Vector = Float[Array, " parameter"]

@@ -160,7 +160,7 @@ def _processors() -> int:
 
 def _fit_together(campaigns: list[Waiting], blocks: int, restarts: bool) -> dict[int, _Fitted]:
     data, slots = side_by_side(campaigns, blocks), campaigns[0].model.slots()
-    first = searches(data, [(i, c.start) for i, c in enumerate(campaigns)], MOST_ITERATIONS)
+    first = searches(data, [(i, c.start) for i, c in enumerate(campaigns)], MOST_ITERATIONS, MOST_ITERATIONS)
     fitted = [_finish(c, slots, *found) for c, found in zip(campaigns, first, strict=True)]
     limit = 1.0 + BAD_FIT * np.sqrt(2.0 / data.freedom)
     fitted = [f._replace(bad=f.lost or f.chi > most) for f, most in zip(fitted, limit, strict=False)]

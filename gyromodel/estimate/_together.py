@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -121,26 +122,36 @@ def _stacked(each: Sequence[Any]) -> Any:
 
 
 @partial(jax.jit, compiler_options=former_fusions())
-def search(data: SideBySide, campaign, start, most) -> tuple[Search, Float[Array, " task"]]:
-    """One search after the other, each of a campaign from a start; and the white variance expected where they end."""
+def search(data: SideBySide, campaign, start, most, thin) -> tuple[Search, Float[Array, " task"]]:
+    """One search after the other, each of a campaign from a start; and the white variance expected where they end.
+
+    A search may begin on a sample of the rows, with at most `thin` points.
+    """
 
     def one(task):
-        campaign, start, most = task
+        campaign, start, most, thin = task
         model, blocks, noise, interval, freedom = jax.tree.map(lambda values: values[campaign], data)
         if noise is not None:
             filter = build_filter(markov_sum(noise.ratios, interval, noise.longest), noise.sampling)
             blocks = blocks._replace(filter=jax.tree.map(lambda v: v.reshape(-1, BLOCK, *v.shape[1:]), filter))
         linear = np.array([slot.linear for slot in model.slots()], bool)
         gram, roughness = gram_and_roughness(model, blocks)
-        found = search_minimum(gram, start, linear, PRECISION**2 / freedom, most)
+        solved = False
+        if len(linear) * 8 <= BLOCK and blocks.thinnable(model):
+            coarse, _ = gram_and_roughness(model, blocks.thinned())
+            begin = search_minimum(coarse, start, linear, 1.0 / BLOCK, thin)
+            start, solved = jnp.where(begin.converged, begin.x, start), begin.converged
+        found = search_minimum(gram, start, linear, PRECISION**2 / freedom, most, solved)
         if not model.noise:
             return found, roughness(found.x)
         return found, model.noise["noise_white"] ** 2 / interval * model.with_vector(found.x).gain() ** 2
 
-    return jax.lax.map(one, (campaign, start, most))
+    return jax.lax.map(one, (campaign, start, most, thin))
 
 
-def searches(data: SideBySide, tasks: Sequence[tuple[int, np.ndarray]], most: int) -> list[tuple[Search, float]]:
+def searches(
+    data: SideBySide, tasks: Sequence[tuple[int, np.ndarray]], most: int, thin: int = 0
+) -> list[tuple[Search, float]]:
     """Searches of campaigns from starts, so many in a call that its arrays have a fixed size."""
     found = []
     for first in range(0, len(tasks), TOGETHER):
@@ -148,6 +159,7 @@ def searches(data: SideBySide, tasks: Sequence[tuple[int, np.ndarray]], most: in
         lack = TOGETHER - len(some)
         campaign = np.array([i for i, _ in some] + [0] * lack)
         start = np.stack([x for _, x in some] + [some[0][1]] * lack)
-        results = jax.tree.map(np.asarray, search(data, campaign, start, np.array([most] * len(some) + [0] * lack)))
+        points = np.array([[most] * len(some) + [0] * lack, [thin] * len(some) + [0] * lack])
+        results = jax.tree.map(np.asarray, search(data, campaign, start, *points))
         found += [jax.tree.map(lambda values, k=k: values[k], results) for k in range(len(some))]
     return found

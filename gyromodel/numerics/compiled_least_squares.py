@@ -22,6 +22,8 @@ LEAST_PIVOT = 1e-14
 ROUNDING = 1e-13
 # Part of the damping that what is linear gets: alone it would need none, and products of it need some.
 LINEAR_SHARE = 1e-4
+# Distance from the minimum, as a part of the cost, below which the rate of convergence is taken from the last step.
+CLOSE = 0.1
 
 
 class Search(NamedTuple):
@@ -41,6 +43,7 @@ class _State(NamedTuple):
     scale: Float[Array, " parameter"]
     step: Float[Array, " parameter"]
     promise: Float[Array, ""]
+    distance: Float[Array, ""]
     damping: Float[Array, ""]
     growth: Float[Array, ""]
     iteration: Int[Array, ""]
@@ -54,6 +57,7 @@ def search_minimum(
     linear: Bool[Array | np.ndarray, " parameter"],
     tolerance: Float[Array, ""] | float,
     most: Int[Array, ""] | int,
+    solved: Bool[Array, ""] | bool = False,
 ) -> Search:
     """Minimise |r(x)|², with one exact solve for the linear parameters at the start.
 
@@ -64,13 +68,14 @@ def search_minimum(
         tolerance: decrease of the cost, as a part of it, that still counts.
         most: points looked at, rejected ones and the start included; with one, `promise` is what the linear solve would
             gain; with none, nothing is computed.
+        solved: whether the start is so near that it needs no linear solve.
 
     Returns:
         The last step of a search that converged is taken without looking at where it leads.
     """
     p = start.shape[0]
     tolerance = jnp.maximum(tolerance, ROUNDING)
-    held = ~jnp.asarray(linear) & jnp.any(linear)
+    held = ~jnp.asarray(linear) & jnp.any(linear) & ~jnp.asarray(solved)
 
     def metric(scale):
         """What the damping multiplies; a long step of what is linear is no danger."""
@@ -101,7 +106,10 @@ def search_minimum(
         # A damped step may be short far from the minimum; what the whole one promises tells how far it is.
         whole = -solve_positive(a, g, jnp.zeros(p, bool))
         least = tolerance * cost_now
-        near = -g @ whole <= least
+        distance = -g @ whole
+        # Once near, each whole step leaves a smaller part of the distance than the one before it.
+        part = jnp.where(state.distance <= CLOSE * cost_now, distance / state.distance, 1.0)
+        near = jnp.minimum(part, 1.0) * distance <= least
         # Where damping has made every step short: at the minimum the residual is orthogonal to every column, or the
         # last step cost or gained next to nothing, as where the cost has a kink.
         short = (promise <= least) & ~(first & held.any())
@@ -114,6 +122,7 @@ def search_minimum(
             scale,
             jnp.where(near, whole, step),
             promise,
+            distance,
             damping,
             growth,
             state.iteration + 1,
@@ -128,6 +137,7 @@ def search_minimum(
         jnp.zeros(p),
         jnp.zeros(p),
         jnp.zeros(()),
+        jnp.asarray(jnp.inf),
         jnp.asarray(LEAST_DAMPING),
         jnp.asarray(2.0),
         jnp.asarray(0),
