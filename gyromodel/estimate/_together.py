@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from gyromodel._compiling import former_fusions
 from gyromodel.estimate._blocks import BLOCK, Blocks, gram_and_roughness
@@ -24,6 +24,8 @@ from gyromodel.signals import Record
 TOGETHER = 16
 # Distance from the minimum, in standard deviations of the parameters, at which a search ends with one more step.
 PRECISION = 1e-5
+# Rows for each parameter that a block must have for a search to begin on no more.
+LEAST_THIN = 8
 
 
 class Waiting(NamedTuple):
@@ -36,10 +38,13 @@ class Waiting(NamedTuple):
     ratios: NoiseRatios | None
 
 
+Memory = dict[tuple[str, int, np.dtype], np.ndarray]
+
+
 def ready(place: int, record: Record, model: GyroModel, given: np.ndarray) -> Waiting:
     """The campaign with its prepared model; ModelError or EstimateError where it cannot be fitted."""
     check_units(model, record.output_unit, record.units)
-    prepared = model.prepared(record.signals)
+    prepared = GyroModel.prepared(model, record.signals)
     start = given if prepared is model else np.asarray(prepared.vector())
     check_enough(record, len(start))
     ratios = given_ratios(record, prepared)
@@ -73,34 +78,40 @@ class SideBySide(NamedTuple):
     freedom: Float[np.ndarray, " campaign"]
 
 
-def side_by_side(campaigns: list[Waiting], blocks: int) -> SideBySide:
-    """Arrays of a fixed size, whatever the number of campaigns: the first stands in for those that lack."""
+def side_by_side(campaigns: list[Waiting], blocks: int, memory: Memory) -> SideBySide:
+    """Arrays of a fixed size, whatever the number of campaigns: the first stands in for those that lack.
+
+    They lie in `memory`, and are those of the campaigns before.
+    """
     campaigns = [*campaigns, *campaigns[:1] * (TOGETHER - len(campaigns))]
     records = [c.record for c in campaigns]
 
-    def padded(each: Iterable[Any]) -> np.ndarray:
-        """Each continued by its last value."""
+    def padded(name: str, each: Iterable[Any], beyond: float | None = None) -> np.ndarray:
+        """Each continued by its last value, or by what is given."""
         first, *others = (np.asarray(values) for values in each)
-        together = np.empty((TOGETHER, blocks * BLOCK), first.dtype)
-        for row, values, record in zip(together, (first, *others), records, strict=True):
+        key = name, blocks, first.dtype
+        if key not in memory:
+            memory[key] = _aligned((TOGETHER, blocks, BLOCK), first.dtype)
+        together = memory[key]
+        flat = together.reshape(TOGETHER, -1)
+        for row, values, record in zip(flat, (first, *others), records, strict=True):
             row[: record.rows] = values[: record.rows]
-            row[record.rows :] = values[record.rows - 1]
-        return together.reshape(TOGETHER, blocks, BLOCK)
+            row[record.rows :] = values[record.rows - 1] if beyond is None else beyond
+        return together
 
-    rows = np.arange(blocks * BLOCK).reshape(blocks, BLOCK) < np.array([r.rows for r in records])[:, None, None]
-    signals = {name: padded(r.signals[name] for r in records) for name in records[0].signals}
-    present = padded(r.sampling.present for r in records) & rows
-    weight = present / np.sqrt(padded(r.sampling.white for r in records))
+    signals = {name: padded(name, (r.signals[name] for r in records)) for name in records[0].signals}
+    weight = padded("_weight", (r.sampling.present / np.sqrt(r.sampling.white) for r in records), 0.0)
     used = np.array([-(-r.rows // BLOCK) for r in records])
     noise = None
     if campaigns[0].ratios is not None:
         flat = (TOGETHER, blocks * BLOCK)
-        interval = padded(r.sampling.interval for r in records).reshape(flat)
-        restart = padded(r.sampling.restart for r in records).reshape(flat)
-        white = padded(r.sampling.white for r in records).reshape(flat)
+        interval = padded("_interval", (r.sampling.interval for r in records)).reshape(flat)
+        restart = padded("_restart", (r.sampling.restart for r in records)).reshape(flat)
+        white = padded("_white", (r.sampling.white for r in records)).reshape(flat)
+        present = padded("_present", (r.sampling.present for r in records), 0.0).reshape(flat)
         ratios = [c.ratios for c in campaigns if c.ratios is not None]
         longest = [float(r.longest(record_span(record))) for r, record in zip(ratios, records, strict=True)]
-        parts: list[Any] = [interval, restart, present.reshape(flat), white]
+        parts: list[Any] = [interval, restart, present, white]
         noise = _Noise(_stacked(ratios), np.array(longest), Sampling(*parts))
     return SideBySide(
         _stacked([c.model for c in campaigns]),
@@ -109,6 +120,14 @@ def side_by_side(campaigns: list[Waiting], blocks: int) -> SideBySide:
         np.array([r.interval for r in records]),
         np.array([float(r.present.sum() - len(c.start)) for r, c in zip(records, campaigns, strict=True)]),
     )
+
+
+def _aligned(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """Memory that JAX on a processor reads where it is, as it begins at a multiple of 64 bytes."""
+    size = int(np.prod(shape)) * dtype.itemsize
+    whole = np.empty(size + 64, np.uint8)
+    first = -whole.ctypes.data % 64
+    return whole[first : first + size].view(dtype).reshape(shape)
 
 
 def _stacked(each: Sequence[Any]) -> Any:
@@ -122,10 +141,14 @@ def _stacked(each: Sequence[Any]) -> Any:
 
 
 @partial(jax.jit, compiler_options=former_fusions())
-def search(data: SideBySide, campaign, start, most, thin) -> tuple[Search, Float[Array, " task"]]:
-    """One search after the other, each of a campaign from a start; and the white variance expected where they end.
+def search(
+    data: SideBySide, campaign, start, most, thin
+) -> tuple[Search, Float[Array, " task"], Bool[Array, " task"]]:
+    """One search after the other, each of a campaign from a start.
 
-    A search may begin on a sample of the rows, with at most `thin` points.
+    Returns:
+        Where they end; the white variance expected there; and whether they began at the minimum of a sample of the
+        rows, found in at most `thin` points.
     """
 
     def one(task):
@@ -136,22 +159,21 @@ def search(data: SideBySide, campaign, start, most, thin) -> tuple[Search, Float
             blocks = blocks._replace(filter=jax.tree.map(lambda v: v.reshape(-1, BLOCK, *v.shape[1:]), filter))
         linear = np.array([slot.linear for slot in model.slots()], bool)
         gram, roughness = gram_and_roughness(model, blocks)
-        solved = False
-        if len(linear) * 8 <= BLOCK and blocks.thinnable(model):
-            coarse, _ = gram_and_roughness(model, blocks.thinned())
-            begin = search_minimum(coarse, start, linear, 1.0 / BLOCK, thin)
-            start, solved = jnp.where(begin.converged, begin.x, start), begin.converged
-        found = search_minimum(gram, start, linear, PRECISION**2 / freedom, most, solved)
+        thinned = jnp.asarray(False)
+        if not linear.all() and len(linear) * LEAST_THIN <= BLOCK and blocks.thinnable(model):
+            begin = search_minimum(gram_and_roughness(model, blocks.thinned())[0], start, linear, 1.0 / BLOCK, thin)
+            start, thinned = jnp.where(begin.converged, begin.x, start), begin.converged
+        found = search_minimum(gram, start, linear, PRECISION**2 / freedom, most, thinned)
         if not model.noise:
-            return found, roughness(found.x)
-        return found, model.noise["noise_white"] ** 2 / interval * model.with_vector(found.x).gain() ** 2
+            return found, roughness(found.x), thinned
+        return found, model.noise["noise_white"] ** 2 / interval * model.with_vector(found.x).gain() ** 2, thinned
 
     return jax.lax.map(one, (campaign, start, most, thin))
 
 
 def searches(
     data: SideBySide, tasks: Sequence[tuple[int, np.ndarray]], most: int, thin: int = 0
-) -> list[tuple[Search, float]]:
+) -> tuple[Search, Float[np.ndarray, " task"], Bool[np.ndarray, " task"]]:
     """Searches of campaigns from starts, so many in a call that its arrays have a fixed size."""
     found = []
     for first in range(0, len(tasks), TOGETHER):
@@ -160,6 +182,5 @@ def searches(
         campaign = np.array([i for i, _ in some] + [0] * lack)
         start = np.stack([x for _, x in some] + [some[0][1]] * lack)
         points = np.array([[most] * len(some) + [0] * lack, [thin] * len(some) + [0] * lack])
-        results = jax.tree.map(np.asarray, search(data, campaign, start, *points))
-        found += [jax.tree.map(lambda values, k=k: values[k], results) for k in range(len(some))]
-    return found
+        found.append(jax.tree.map(lambda v, n=len(some): np.asarray(v)[:n], search(data, campaign, start, *points)))
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *found)

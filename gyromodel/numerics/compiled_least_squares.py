@@ -24,6 +24,8 @@ ROUNDING = 1e-13
 LINEAR_SHARE = 1e-4
 # Distance from the minimum, as a part of the cost, below which the rate of convergence is taken from the last step.
 CLOSE = 0.1
+# By how much the squared distance may fall more slowly than it did: what converges fast is gone first.
+SAFETY = 10.0
 
 
 class Search(NamedTuple):
@@ -109,7 +111,7 @@ def search_minimum(
         distance = -g @ whole
         # Once near, each whole step leaves a smaller part of the distance than the one before it.
         part = jnp.where(state.distance <= CLOSE * cost_now, distance / state.distance, 1.0)
-        near = jnp.minimum(part, 1.0) * distance <= least
+        near = jnp.minimum(SAFETY * part, 1.0) * distance <= least
         # Where damping has made every step short: at the minimum the residual is orthogonal to every column, or the
         # last step cost or gained next to nothing, as where the cost has a kink.
         short = (promise <= least) & ~(first & held.any())
