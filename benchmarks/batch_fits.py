@@ -257,7 +257,7 @@ def one_pass(parameters: int) -> dict[str, Any]:
     import jax.numpy as jnp
     from scipy.linalg.blas import dsyrk
 
-    from gyromodel.estimate._blocks import BLOCK, Blocks, gram_and_roughness
+    from gyromodel.estimate._blocks import BLOCK, Blocks, gram_of
 
     model = thermal_rate_model(parameters)
     record = next(campaigns(model, 1, (5120, 5120)))
@@ -269,9 +269,9 @@ def one_pass(parameters: int) -> dict[str, Any]:
     @partial(jax.jit, compiler_options=former_fusions())
     def passes(x, signals, weight, count):
         data = Blocks(signals, weight, jnp.asarray(blocks), None)
-        gram = gram_and_roughness(model, data)[0]
+        gram = gram_of(model, data)
         # Each pass begins where the last one ended, as far as the compiler knows.
-        return jax.lax.fori_loop(0, count, lambda _, g: gram(x + 1e-300 * g[0, 0]), jnp.zeros((len(x) + 1,) * 2))
+        return jax.lax.fori_loop(0, count, lambda _, g: gram(x + 1e-300 * g[0, 0]), jnp.zeros((len(x) + 2,) * 2))
 
     columns = np.column_stack(model.with_vector(x).linearise(record.signals)).T
     stacked = np.asfortranarray(columns.T)

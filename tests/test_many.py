@@ -109,13 +109,13 @@ def test_values_are_scipys_on_the_equation(rng: np.random.Generator):
 def test_one_trace_for_each_power_of_two_of_lengths(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch):
     traces: list[int] = []
     _together.search.clear_cache()
-    whole = _together.gram_and_roughness
+    whole = _together.gram_of
 
     def counted(model, data):
         traces.append(data.weight.shape[0])
         return whole(model, data)
 
-    monkeypatch.setattr(_together, "gram_and_roughness", counted)
+    monkeypatch.setattr(_together, "gram_of", counted)
     base = [campaign(rng, rows) for rows in (200, 400, 600)]
     records = [again(base[i % 3], rng) for i in range(70)]
     fit_many(records, thermal_model(), threads=3)

@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax.scipy.linalg import block_diag
+from jaxtyping import Array, Bool, Float
 
 from gyromodel.effects import Effect, Signals
 from gyromodel.model import GyroModel
@@ -50,18 +51,14 @@ class Blocks(NamedTuple):
         return Blocks(signals, weight, 1, None)
 
 
-Known = Mapping[int, Rows]
 Vector = Float[Array, " parameter"]
 
 
-def gram_and_roughness(
-    model: GyroModel, data: Blocks
-) -> tuple[Callable[[Vector], Float[Array, "column column"]], Callable[[Vector], Float[Array, ""]]]:
-    """Two functions of the free parameters; rows that no nonlinear parameter shapes are computed once for both.
+def gram_of(model: GyroModel, data: Blocks) -> Callable[[Vector], Float[Array, "column column"]]:
+    """[J, r]ᵀ[J, r] of the whitened residual r as a function of the free parameters, one more row and column behind it.
 
-    Returns:
-        [J, r]ᵀ[J, r] of the whitened residual r; and half the mean square of the successive differences of the weighted
-        residual, which is the variance of its white part.
+    In these the sum of squares of r's successive differences within blocks stands by itself. Rows that no nonlinear
+    parameter shapes are computed once.
     """
     free = _free(model)
 
@@ -81,47 +78,36 @@ def gram_and_roughness(
         if effect.site not in LATER and not _shaped(effect, free.get(i, ()))
     }
 
-    def at(x: Vector) -> tuple[GyroModel, Known]:
-        """The model and its rows, before they are multiplied by what they act on.
-
-        In a loop of their own: the compiler would compute an exponential again for each row that contains it.
-        """
-        now = model.with_vector(x)
-        others = {i: rows_of(e, free[i]) for i, e in enumerate(now.effects) if e.site not in LATER and i not in steady}
-        return now, steady | others
-
     def gram(x: Vector) -> Float[Array, "column column"]:
-        now, known = at(x)
+        now = model.with_vector(x)
+        # In a loop of their own: the compiler would compute an exponential again for each row that contains it.
+        others = {i: rows_of(e, free[i]) for i, e in enumerate(now.effects) if e.site not in LATER and i not in steady}
+        known = steady | others
 
         def add(block, carry):
-            state, total = carry
+            state, total, rough = carry
             part = jax.tree.map(lambda values: values[block], (data.signals, data.weight, known, data.filter))
             signals, weight, rows, filter = part
             stacked = _stacked(now, signals, rows, free, weight if filter is None else jnp.sign(weight))
             if filter is not None:
                 state, white = whiten_on(state, filter, stacked.T)
                 stacked = white.T
-            return state, total + stacked @ stacked.T
+            rough += jnp.sum(jnp.where(in_turn(weight), jnp.diff(stacked[-1]), 0.0) ** 2)
+            return state, total + stacked @ stacked.T, rough
 
         width = x.shape[0] + 1
         state = jnp.zeros(0)
         if data.filter is not None:
             state = at_rest(jax.tree.map(lambda values: values[0], data.filter), width)
-        return jax.lax.fori_loop(0, data.used, add, (state, jnp.zeros((width, width))))[1]
+        _, total, rough = jax.lax.fori_loop(0, data.used, add, (state, jnp.zeros((width, width)), jnp.zeros(())))
+        return block_diag(total, rough)
 
-    def roughness(x: Vector) -> Float[Array, ""]:
-        now, known = at(x)
+    return gram
 
-        def add(block, carry):
-            signals, weight, rows = jax.tree.map(lambda values: values[block], (data.signals, data.weight, known))
-            change = jnp.diff(_stacked(now, signals, rows, free, weight)[-1])
-            both = (weight[1:] > 0) & (weight[:-1] > 0)
-            return carry[0] + jnp.sum(jnp.where(both, change, 0.0) ** 2), carry[1] + both.sum()
 
-        squares, pairs = jax.lax.fori_loop(0, data.used, add, (jnp.zeros(()), jnp.zeros((), int)))
-        return squares / 2.0 / jnp.maximum(pairs, 1)
-
-    return gram, roughness
+def in_turn(weight: Float[Array, "*block sample"]) -> Bool[Array, "*block pair"]:
+    """Which samples and those after them in their block are both there."""
+    return (weight[..., 1:] > 0) & (weight[..., :-1] > 0)
 
 
 def _over_blocks(rows: Callable[[Signals], Rows], data: Blocks) -> Rows:

@@ -171,7 +171,8 @@ def _fit_together(campaigns: list[Waiting], blocks: int, restarts: bool, memory:
     chosen = []
     if tried:
         found, *_ = searches(data, tried, 1)
-        looked = found.cost - found.promise
+        p = found.x.shape[1]
+        looked = found.gram[:, p, p] - found.promise
         for i in {i for i, _ in tried}:
             own = [(cost, k) for k, cost in enumerate(looked) if tried[k][0] == i and np.isfinite(cost)]
             chosen += [tried[k] for _, k in sorted(own)[:FOLLOWED]]
@@ -195,16 +196,16 @@ def _followed(
     if not tasks:
         return []
     found, expected, thinned = searches(data, tasks, MOST_ITERATIONS, MOST_ITERATIONS * thin)
-    freedom = data.freedom[[i for i, _ in tasks]]
-    white = (found.cost - found.promise) / freedom
+    p, freedom = found.x.shape[1], data.freedom[[i for i, _ in tasks]]
+    white = (found.gram[:, p, p] - found.promise) / freedom
     chi, limit = white / expected, 1.0 + BAD_FIT * np.sqrt(2.0 / freedom)
-    inverse, root, whole = _inverses(found.information)
+    inverse, root, whole = _inverses(found.gram[:, :p, :p])
     slots, fits = campaigns[0].model.slots(), []
     for k, (i, _) in enumerate(tasks):
         model, x, converged, iterations = campaigns[i].model, found.x[k], bool(found.converged[k]), found.iterations[k]
         lost = False
         try:
-            if not np.isfinite(found.cost[k]):
+            if not np.isfinite(white[k]):
                 check_covariates(campaigns[i].record, model)
                 raise EstimateError("the model is not finite at its start values: give others")
             lost = not converged or not _possible(model, slots, x)

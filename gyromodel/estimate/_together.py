@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from gyromodel._compiling import former_fusions
-from gyromodel.estimate._blocks import BLOCK, Blocks, gram_and_roughness
+from gyromodel.estimate._blocks import BLOCK, Blocks, gram_of, in_turn
 from gyromodel.estimate._fit import check_enough, given_ratios
 from gyromodel.model import GyroModel, check_units, record_span
 from gyromodel.noise import NoiseRatios, markov_sum
@@ -158,15 +158,15 @@ def search(
             filter = build_filter(markov_sum(noise.ratios, interval, noise.longest), noise.sampling)
             blocks = blocks._replace(filter=jax.tree.map(lambda v: v.reshape(-1, BLOCK, *v.shape[1:]), filter))
         linear = np.array([slot.linear for slot in model.slots()], bool)
-        gram, roughness = gram_and_roughness(model, blocks)
+        gram = gram_of(model, blocks)
         thinned = jnp.asarray(False)
         if not linear.all() and len(linear) * LEAST_THIN <= BLOCK and blocks.thinnable(model):
-            begin = search_minimum(gram_and_roughness(model, blocks.thinned())[0], start, linear, 1.0 / BLOCK, thin)
+            begin = search_minimum(gram_of(model, blocks.thinned()), start, linear, 1.0 / BLOCK, thin)
             start, thinned = jnp.where(begin.converged, begin.x, start), begin.converged
         found = search_minimum(gram, start, linear, PRECISION**2 / freedom, most, thinned)
-        if not model.noise:
-            return found, roughness(found.x), thinned
-        return found, model.noise["noise_white"] ** 2 / interval * model.with_vector(found.x).gain() ** 2, thinned
+        if model.noise:
+            return found, model.noise["noise_white"] ** 2 / interval * model.with_vector(found.x).gain() ** 2, thinned
+        return found, found.gram[-1, -1] / 2 / jnp.maximum(in_turn(blocks.weight).sum(), 1), thinned
 
     return jax.lax.map(one, (campaign, start, most, thin))
 

@@ -29,11 +29,10 @@ SAFETY = 10.0
 
 
 class Search(NamedTuple):
-    """Where a search ended: the point, the cost there, JᵀJ, and the decrease that its next step promises."""
+    """Where a search ended: the point, `gram` there, and the decrease of the cost that its next step promises."""
 
     x: Float[Array, " parameter"]
-    cost: Float[Array, ""]
-    information: Float[Array, "parameter parameter"]
+    gram: Float[Array, "column column"]
     promise: Float[Array, ""]
     iterations: Int[Array, ""]
     converged: Bool[Array, ""]
@@ -64,7 +63,7 @@ def search_minimum(
     """Minimise |r(x)|², with one exact solve for the linear parameters at the start.
 
     Args:
-        gram: [J, r]ᵀ[J, r] at a point, J the derivative of r.
+        gram: [J, r]ᵀ[J, r] at a point, J the derivative of r; rows and columns behind are the caller's own.
         start: where to begin.
         linear: which parameters r is linear in.
         tolerance: decrease of the cost, as a part of it, that still counts.
@@ -132,7 +131,7 @@ def search_minimum(
             near | (short & (orthogonal | kink)),
         )
 
-    nothing = jnp.full((p + 1, p + 1), jnp.inf)
+    nothing = jnp.full(jax.eval_shape(gram, start).shape, jnp.inf)
     begin = _State(
         start,
         nothing,
@@ -149,7 +148,7 @@ def search_minimum(
     end = jax.lax.while_loop(lambda s: ~s.ended & (s.iteration < most), look, begin)
     polished = end.converged & jnp.isfinite(end.step).all()
     x = jnp.where(polished, end.x + end.step, end.x)
-    return Search(x, end.gram[p, p], end.gram[:p, :p], end.promise, end.iteration, end.converged)
+    return Search(x, end.gram, end.promise, end.iteration, end.converged)
 
 
 def solve_positive(
