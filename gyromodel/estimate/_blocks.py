@@ -48,7 +48,7 @@ class Blocks(NamedTuple):
         every = self.weight.shape[0]
         chosen = every * np.arange(BLOCK) + np.random.default_rng(0).integers(every, size=BLOCK)
         signals, weight = jax.tree.map(lambda v: v.reshape(-1)[chosen][None], (self.signals, self.weight))
-        return Blocks(signals, weight, 1, None)
+        return Blocks(signals, weight, jnp.minimum(self.used, 1), None)
 
 
 Vector = Float[Array, " parameter"]
@@ -80,14 +80,21 @@ def gram_of(model: GyroModel, data: Blocks) -> Callable[[Vector], Float[Array, "
 
     def gram(x: Vector) -> Float[Array, "column column"]:
         now = model.with_vector(x)
-        # In a loop of their own: the compiler would compute an exponential again for each row that contains it.
-        others = {i: rows_of(e, free[i]) for i, e in enumerate(now.effects) if e.site not in LATER and i not in steady}
-        known = steady | others
+        others = {i: e for i, e in enumerate(now.effects) if e.site not in LATER and i not in steady}
+        known = steady | {i: rows_of(e, free[i]) for i, e in others.items() if e.remembers}
 
         def add(block, carry):
             state, total, rough = carry
             part = jax.tree.map(lambda values: values[block], (data.signals, data.weight, known, data.filter))
             signals, weight, rows, filter = part
+
+            def shaped():
+                found = {i: _rows(e, signals, free[i]) for i, e in others.items() if not e.remembers}
+                return jax.tree.map(lambda values: jnp.where(weight > 0, values, 0.0), found)
+
+            # Under a condition that always holds: the compiler would compute an exponential again for each row with it.
+            nothing = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(shaped))
+            rows = rows | jax.lax.cond(block < data.used, shaped, lambda: nothing)
             stacked = _stacked(now, signals, rows, free, weight if filter is None else jnp.sign(weight))
             if filter is not None:
                 state, white = whiten_on(state, filter, stacked.T)

@@ -26,6 +26,8 @@ TOGETHER = 16
 PRECISION = 1e-5
 # Rows for each parameter that a block must have for a search to begin on no more.
 LEAST_THIN = 8
+# Decrease of the cost, as a part of it, at which a search on a sample of the rows ends: a standard deviation there.
+THIN_TOLERANCE = 1.0 / BLOCK
 
 
 class Waiting(NamedTuple):
@@ -161,7 +163,7 @@ def search(
         gram = gram_of(model, blocks)
         thinned = jnp.asarray(False)
         if not linear.all() and len(linear) * LEAST_THIN <= BLOCK and blocks.thinnable(model):
-            begin = search_minimum(gram_of(model, blocks.thinned()), start, linear, 1.0 / BLOCK, thin)
+            begin = search_minimum(gram_of(model, blocks.thinned()), start, linear, THIN_TOLERANCE, thin)
             start, thinned = jnp.where(begin.converged, begin.x, start), begin.converged
         found = search_minimum(gram, start, linear, PRECISION**2 / freedom, most, thinned)
         if model.noise:
