@@ -19,7 +19,17 @@ from jaxtyping import Bool, Float, Int
 from gyromodel.effects import Effect, Signals
 from gyromodel.estimate._estimate import EstimateError
 from gyromodel.estimate._fit import SINGULAR, check_covariates, checked_solution, unit_covariance
-from gyromodel.estimate._together import TOGETHER, Memory, SideBySide, Waiting, kind_of, ready, searches, side_by_side
+from gyromodel.estimate._together import (
+    TOGETHER,
+    Memory,
+    SideBySide,
+    Waiting,
+    described,
+    kind_of,
+    ready,
+    searches,
+    side_by_side,
+)
 from gyromodel.model import GyroModel, Slot
 from gyromodel.signals import Record
 from gyromodel.units import factor, internal_unit
@@ -111,7 +121,7 @@ def fit_many(
         raise EstimateError("JAX runs in single precision; import gyromodel before using jax, or set JAX_ENABLE_X64=1")
     threads = threads or _processors()
     prepared: list[GyroModel] = []
-    given = np.asarray(model.vector())
+    given = described(model)
     done: dict[int, _Fitted] = {}
     waiting: dict[Any, list[Waiting]] = {}
     compiled: dict[Any, threading.Event] = {}
@@ -139,7 +149,7 @@ def fit_many(
         for place, record in enumerate(records):
             prepared.append(model)
             try:
-                campaign = ready(place, record, model, given)
+                campaign = ready(place, record, given)
             except ValueError as problem:
                 done[place] = _failed(str(problem))
                 continue
@@ -241,12 +251,14 @@ def _possible(model: GyroModel, slots: Sequence[Slot], x: np.ndarray) -> bool:
     """Whether no nonlinear parameter has left what its effect can be."""
     changed: dict[int, Effect] = {}
     for slot, value in zip(slots, x, strict=True):
-        if not slot.linear:
-            effect = changed.setdefault(slot.effect, copy(model.effects[slot.effect]))
-            values = np.array(getattr(effect, slot.field))
-            values.flat[slot.index] = value
-            # A new effect with arrays of JAX would take longer than its part of the fit.
-            vars(effect)[slot.field] = values
+        if slot.linear:
+            continue
+        if slot.effect not in changed:
+            changed[slot.effect] = copy(model.effects[slot.effect])
+        # A new effect with arrays of JAX would take longer than its part of the fit.
+        fields = vars(changed[slot.effect])
+        fields[slot.field] = np.array(fields[slot.field])
+        fields[slot.field].flat[slot.index] = value
     try:
         for effect in changed.values():
             for kind in type(effect).__mro__:

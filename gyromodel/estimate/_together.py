@@ -30,6 +30,20 @@ LEAST_THIN = 8
 THIN_TOLERANCE = 1.0 / BLOCK
 
 
+class Prepared(NamedTuple):
+    """A model, its free parameters, and its structure with the shapes of its arrays."""
+
+    model: GyroModel
+    start: np.ndarray
+    structure: tuple
+
+
+def described(model: GyroModel) -> Prepared:
+    """A model beside what is asked of it for each campaign."""
+    leaves, structure = jax.tree.flatten(model)
+    return Prepared(model, np.asarray(model.vector()), (structure, tuple(np.shape(leaf) for leaf in leaves)))
+
+
 class Waiting(NamedTuple):
     """One that waits to be fitted: where it stands, its data, and its prepared model."""
 
@@ -37,29 +51,28 @@ class Waiting(NamedTuple):
     record: Record
     model: GyroModel
     start: np.ndarray
+    structure: tuple
     ratios: NoiseRatios | None
 
 
 Memory = dict[tuple[str, int, np.dtype], np.ndarray]
 
 
-def ready(place: int, record: Record, model: GyroModel, given: np.ndarray) -> Waiting:
+def ready(place: int, record: Record, given: Prepared) -> Waiting:
     """The campaign with its prepared model; ModelError or EstimateError where it cannot be fitted."""
-    check_units(model, record.output_unit, record.units)
-    prepared = GyroModel.prepared(model, record.signals)
-    start = given if prepared is model else np.asarray(prepared.vector())
-    check_enough(record, len(start))
-    ratios = given_ratios(record, prepared)
+    check_units(given.model, record.output_unit, record.units)
+    model = GyroModel.prepared(given.model, record.signals)
+    prepared = given if model is given.model else described(model)
+    check_enough(record, len(prepared.start))
+    ratios = given_ratios(record, model)
     coloured = ratios is not None and any(float(r) > 0 for r in ratios[:3])
-    return Waiting(place, record, prepared, start, ratios if coloured else None)
+    return Waiting(place, record, *prepared, ratios if coloured else None)
 
 
 def kind_of(campaign: Waiting) -> tuple:
     """What must be alike for one program: blocks (a power of two), model structure, signals, colour of the noise."""
     blocks = 2 ** max(int(np.ceil(np.log2(campaign.record.rows / BLOCK))), 0)
-    leaves, structure = jax.tree.flatten(campaign.model)
-    shapes = tuple(np.shape(leaf) for leaf in leaves)
-    return blocks, structure, shapes, tuple(sorted(campaign.record.signals)), campaign.ratios is None
+    return blocks, campaign.structure, tuple(sorted(campaign.record.signals)), campaign.ratios is None
 
 
 class _Noise(NamedTuple):
