@@ -12,6 +12,7 @@ from copy import copy
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -121,6 +122,8 @@ def fit_many(
         raise EstimateError("JAX runs in single precision; import gyromodel before using jax, or set JAX_ENABLE_X64=1")
     threads = threads or _processors()
     prepared: list[GyroModel] = []
+    # Prepared for each campaign, it is asked for its numbers, which takes longer of arrays of JAX.
+    model = jax.tree.map(np.asarray, model)
     given = described(model)
     done: dict[int, _Fitted] = {}
     waiting: dict[Any, list[Waiting]] = {}

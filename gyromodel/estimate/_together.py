@@ -21,7 +21,7 @@ from gyromodel.numerics.state_space import Sampling, build_filter
 from gyromodel.signals import Record
 
 # Campaigns handed to the compiled program in one call.
-TOGETHER = 16
+TOGETHER = 32
 # Distance from the minimum, in standard deviations of the parameters, at which a search ends with one more step.
 PRECISION = 1e-5
 # Rows for each parameter that a block must have for a search to begin on no more.
