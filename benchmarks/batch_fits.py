@@ -262,13 +262,13 @@ def one_pass(parameters: int) -> dict[str, Any]:
     model = thermal_rate_model(parameters)
     record = next(campaigns(model, 1, (5120, 5120)))
     blocks = 5120 // BLOCK
-    signals = {k: jnp.asarray(v).reshape(blocks, BLOCK) for k, v in record.signals.items()}
+    signals = {k: jnp.asarray(v).reshape(1, blocks, BLOCK) for k, v in record.signals.items()}
     x = jnp.asarray(truth(model, np.random.default_rng(0)))
-    weight, repeats = jnp.ones((blocks, BLOCK)), 200
+    weight, repeats = jnp.ones((1, blocks, BLOCK)), 200
 
     @partial(jax.jit, compiler_options=former_fusions())
     def passes(x, signals, weight, used, count):
-        data = Blocks(signals, weight, used, None)
+        data = Blocks(signals, weight, 0, used, None)
         gram = gram_of(model, data)
         # Each pass begins where the last one ended, as far as the compiler knows.
         return jax.lax.fori_loop(0, count, lambda _, g: gram(x + 1e-300 * g[0, 0]), jnp.zeros((len(x) + 2,) * 2))

@@ -28,27 +28,34 @@ Rows = tuple[Float[Array, "*block coefficient sample"], Float[Array, "*block sha
 
 
 class Blocks(NamedTuple):
-    """A campaign's samples in blocks, or many campaigns' with one axis more.
+    """A campaign's samples in blocks, among those of others.
 
-    Of signals and `weight` the axes are block and sample. `weight` is one over the white noise relative to its unit,
-    zero where there is no sample; `used` counts the blocks that hold samples; with `filter` the noise is coloured.
+    Of signals and `weight` the axes are campaign, block and sample. `weight` is one over the white noise relative to
+    its unit, zero where there is no sample; `used` counts the blocks of this campaign that hold samples; with `filter`,
+    its own, the noise is coloured.
     """
 
     signals: Mapping[str, Any]
     weight: Any
+    campaign: Any
     used: Any
     filter: Filter | None
 
+    def part(self, block: Any) -> tuple[dict[str, Any], Any]:
+        """Signals and weight of one block."""
+        return {name: v[self.campaign, block] for name, v in self.signals.items()}, self.weight[self.campaign, block]
+
     def thinnable(self, model: GyroModel) -> bool:
         """Whether samples may be left out."""
-        return self.filter is None and len(self.weight) >= 4 and not any(e.remembers for e in model.effects)
+        return self.filter is None and self.weight.shape[1] >= 4 and not any(e.remembers for e in model.effects)
 
     def thinned(self) -> Blocks:
         """One block, of one sample out of as many as there are blocks, by chance, as regular ones may fit a period."""
-        every = self.weight.shape[0]
+        every = self.weight.shape[1]
         chosen = every * np.arange(BLOCK) + np.random.default_rng(0).integers(every, size=BLOCK)
-        signals, weight = jax.tree.map(lambda v: v.reshape(-1)[chosen][None], (self.signals, self.weight))
-        return Blocks(signals, weight, jnp.minimum(self.used, 1), None)
+        places = self.campaign, *np.divmod(chosen, BLOCK)
+        signals, weight = jax.tree.map(lambda values: values[places][None, None], (self.signals, self.weight))
+        return Blocks(signals, weight, 0, jnp.minimum(self.used, 1), None)
 
 
 Vector = Float[Array, " parameter"]
@@ -62,14 +69,12 @@ def gram_of(model: GyroModel, data: Blocks) -> Callable[[Vector], Float[Array, "
     """
     free = _free(model)
 
-    present = data.weight > 0
-
     def rows_of(effect: Effect, names: tuple[str, ...]) -> Rows:
         """Zero where there is no sample, and what is read there may not be a number."""
         if effect.remembers:  # it looks at neighbouring samples, and must see all of them
-            whole = {name: values.ravel() for name, values in data.signals.items()}
+            whole = {name: values[data.campaign].ravel() for name, values in data.signals.items()}
             rows = jax.tree.map(_in_blocks, _rows(effect, whole, names))
-            return jax.tree.map(lambda values: jnp.where(present[:, None], values, 0.0), rows)
+            return jax.tree.map(lambda values: jnp.where(data.weight[data.campaign][:, None] > 0, values, 0.0), rows)
         return _over_blocks(lambda part: _rows(effect, part, names), data)
 
     steady = {
@@ -85,8 +90,8 @@ def gram_of(model: GyroModel, data: Blocks) -> Callable[[Vector], Float[Array, "
 
         def add(block, carry):
             state, total, rough = carry
-            part = jax.tree.map(lambda values: values[block], (data.signals, data.weight, known, data.filter))
-            signals, weight, rows, filter = part
+            signals, weight = data.part(block)
+            rows, filter = jax.tree.map(lambda values: values[block], (known, data.filter))
 
             def shaped():
                 found = {i: _rows(e, signals, free[i]) for i, e in others.items() if not e.remembers}
@@ -119,13 +124,13 @@ def in_turn(weight: Float[Array, "*block sample"]) -> Bool[Array, "*block pair"]
 
 def _over_blocks(rows: Callable[[Signals], Rows], data: Blocks) -> Rows:
     """Rows of every block that holds samples, zeros elsewhere."""
-    shapes = jax.eval_shape(rows, {name: values[0] for name, values in data.signals.items()})
-    blocks = data.weight.shape[0]
+    shapes = jax.eval_shape(lambda: rows(data.part(0)[0]))
+    blocks = data.weight.shape[1]
 
     def put(block, found):
-        part = rows({name: values[block] for name, values in data.signals.items()})
+        signals, weight = data.part(block)
         return jax.tree.map(
-            lambda all, one: all.at[block].set(jnp.where(data.weight[block] > 0, one, 0.0)), found, part
+            lambda all, one: all.at[block].set(jnp.where(weight > 0, one, 0.0)), found, rows(signals)
         )
 
     return jax.lax.fori_loop(0, data.used, put, jax.tree.map(lambda s: jnp.zeros((blocks, *s.shape), s.dtype), shapes))

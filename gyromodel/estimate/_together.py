@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from gyromodel._compiling import former_fusions
 from gyromodel.estimate._blocks import BLOCK, Blocks, gram_of, in_turn
@@ -87,7 +87,9 @@ class SideBySide(NamedTuple):
     """Campaigns side by side, the first axis of every array."""
 
     models: GyroModel
-    blocks: Blocks
+    signals: Mapping[str, Any]
+    weight: Float[np.ndarray, "campaign block sample"]
+    used: Int[np.ndarray, " campaign"]
     noise: _Noise | None
     interval: Float[np.ndarray, " campaign"]
     freedom: Float[np.ndarray, " campaign"]
@@ -130,7 +132,9 @@ def side_by_side(campaigns: list[Waiting], blocks: int, memory: Memory) -> SideB
         noise = _Noise(_stacked(ratios), np.array(longest), Sampling(*parts))
     return SideBySide(
         _stacked([c.model for c in campaigns]),
-        Blocks(signals, weight, used, None),
+        signals,
+        weight,
+        used,
         noise,
         np.array([r.interval for r in records]),
         np.array([float(r.present.sum() - len(c.start)) for r, c in zip(records, campaigns, strict=True)]),
@@ -168,7 +172,11 @@ def search(
 
     def one(task):
         campaign, start, most, thin = task
-        model, blocks, noise, interval, freedom = jax.tree.map(lambda values: values[campaign], data)
+        # The samples are read where they are.
+        model, used, noise, interval, freedom = jax.tree.map(
+            lambda values: values[campaign], (data.models, data.used, data.noise, data.interval, data.freedom)
+        )
+        blocks = Blocks(data.signals, data.weight, campaign, used, None)
         if noise is not None:
             filter = build_filter(markov_sum(noise.ratios, interval, noise.longest), noise.sampling)
             blocks = blocks._replace(filter=jax.tree.map(lambda v: v.reshape(-1, BLOCK, *v.shape[1:]), filter))
@@ -181,7 +189,7 @@ def search(
         found = search_minimum(gram, start, linear, PRECISION**2 / freedom, most, thinned)
         if model.noise:
             return found, model.noise["noise_white"] ** 2 / interval * model.with_vector(found.x).gain() ** 2, thinned
-        return found, found.gram[-1, -1] / 2 / jnp.maximum(in_turn(blocks.weight).sum(), 1), thinned
+        return found, found.gram[-1, -1] / 2 / jnp.maximum(in_turn(blocks.weight[campaign]).sum(), 1), thinned
 
     return jax.lax.map(one, (campaign, start, most, thin))
 
