@@ -112,7 +112,7 @@ def test_one_trace_for_each_power_of_two_of_lengths(rng: np.random.Generator, mo
     whole = _together.gram_of
 
     def counted(model, data):
-        traces.append(data.weight.shape[0])
+        traces.append(data.weight.shape[1])
         return whole(model, data)
 
     monkeypatch.setattr(_together, "gram_of", counted)
