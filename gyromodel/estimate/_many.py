@@ -8,7 +8,6 @@ import threading
 from collections import deque
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from copy import copy
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -257,8 +256,9 @@ def _possible(model: GyroModel, slots: Sequence[Slot], x: np.ndarray) -> bool:
         if slot.linear:
             continue
         if slot.effect not in changed:
-            changed[slot.effect] = copy(model.effects[slot.effect])
-        # A new effect with arrays of JAX would take longer than its part of the fit.
+            # A new effect made as usual, with arrays of JAX, would take longer than its part of the fit.
+            changed[slot.effect] = object.__new__(type(model.effects[slot.effect]))
+            vars(changed[slot.effect]).update(vars(model.effects[slot.effect]))
         fields = vars(changed[slot.effect])
         fields[slot.field] = np.array(fields[slot.field])
         fields[slot.field].flat[slot.index] = value

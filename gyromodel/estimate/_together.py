@@ -31,17 +31,18 @@ THIN_TOLERANCE = 1.0 / BLOCK
 
 
 class Prepared(NamedTuple):
-    """A model, its free parameters, and its structure with the shapes of its arrays."""
+    """A model, its free parameters, its structure with the shapes of its arrays, and units that are known to suit."""
 
     model: GyroModel
     start: np.ndarray
     structure: tuple
+    suit: set[tuple]
 
 
 def described(model: GyroModel) -> Prepared:
     """A model beside what is asked of it for each campaign."""
     leaves, structure = jax.tree.flatten(model)
-    return Prepared(model, np.asarray(model.vector()), (structure, tuple(np.shape(leaf) for leaf in leaves)))
+    return Prepared(model, np.asarray(model.vector()), (structure, tuple(np.shape(leaf) for leaf in leaves)), set())
 
 
 class Waiting(NamedTuple):
@@ -60,13 +61,16 @@ Memory = dict[tuple[str, int, np.dtype], np.ndarray]
 
 def ready(place: int, record: Record, given: Prepared) -> Waiting:
     """The campaign with its prepared model; ModelError or EstimateError where it cannot be fitted."""
-    check_units(given.model, record.output_unit, record.units)
+    units = record.output_unit, *record.units.items()
+    if units not in given.suit:
+        check_units(given.model, record.output_unit, record.units)
+        given.suit.add(units)
     model = GyroModel.prepared(given.model, record.signals)
     prepared = given if model is given.model else described(model)
     check_enough(record, len(prepared.start))
     ratios = given_ratios(record, model)
     coloured = ratios is not None and any(float(r) > 0 for r in ratios[:3])
-    return Waiting(place, record, *prepared, ratios if coloured else None)
+    return Waiting(place, record, model, prepared.start, prepared.structure, ratios if coloured else None)
 
 
 def kind_of(campaign: Waiting) -> tuple:
