@@ -129,9 +129,7 @@ def _over_blocks(rows: Callable[[Signals], Rows], data: Blocks) -> Rows:
 
     def put(block, found):
         signals, weight = data.part(block)
-        return jax.tree.map(
-            lambda all, one: all.at[block].set(jnp.where(weight > 0, one, 0.0)), found, rows(signals)
-        )
+        return jax.tree.map(lambda all, one: all.at[block].set(jnp.where(weight > 0, one, 0.0)), found, rows(signals))
 
     return jax.lax.fori_loop(0, data.used, put, jax.tree.map(lambda s: jnp.zeros((blocks, *s.shape), s.dtype), shapes))
 

@@ -164,9 +164,7 @@ def _stacked(each: Sequence[Any]) -> Any:
 
 
 @partial(jax.jit, compiler_options=former_fusions())
-def search(
-    data: SideBySide, campaign, start, most, thin
-) -> tuple[Search, Float[Array, " task"], Bool[Array, " task"]]:
+def search(data: SideBySide, campaign, start, most, thin) -> tuple[Search, Float[Array, " task"], Bool[Array, " task"]]:
     """One search after the other, each of a campaign from a start.
 
     Returns:

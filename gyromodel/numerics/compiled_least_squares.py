@@ -24,8 +24,8 @@ ROUNDING = 1e-13
 LINEAR_SHARE = 1e-4
 # Distance from the minimum, as a part of the cost, below which the rate of convergence is taken from the last step.
 CLOSE = 0.1
-# By how much the squared distance may fall more slowly than it did: what converges fast is gone first.
-SAFETY = 10.0
+# By how much more of the squared distance a step may leave than those before it did.
+SAFETY = 5.0
 
 
 class Search(NamedTuple):
@@ -45,6 +45,7 @@ class _State(NamedTuple):
     step: Float[Array, " parameter"]
     promise: Float[Array, ""]
     distance: Float[Array, ""]
+    part: Float[Array, ""]
     damping: Float[Array, ""]
     growth: Float[Array, ""]
     iteration: Int[Array, ""]
@@ -108,9 +109,10 @@ def search_minimum(
         whole = -solve_positive(a, g, jnp.zeros(p, bool))
         least = tolerance * cost_now
         distance = -g @ whole
-        # Once near, each whole step leaves a smaller part of the distance than the one before it.
-        part = jnp.where(state.distance <= CLOSE * cost_now, distance / state.distance, 1.0)
-        near = jnp.minimum(SAFETY * part, 1.0) * distance <= least
+        # What the next step will leave of the distance is told from what the last two left: one by itself may have been
+        # lucky, or have taken away what is linear.
+        part = jnp.where(better & (state.distance <= CLOSE * cost_now), distance / state.distance, 1.0)
+        near = jnp.minimum(SAFETY * jnp.sqrt(part * state.part), 1.0) * distance <= least
         # Where damping has made every step short: at the minimum the residual is orthogonal to every column, or the
         # last step cost or gained next to nothing, as where the cost has a kink.
         short = (promise <= least) & ~(first & held.any())
@@ -124,6 +126,7 @@ def search_minimum(
             jnp.where(near, whole, step),
             promise,
             distance,
+            part,
             damping,
             growth,
             state.iteration + 1,
@@ -139,6 +142,7 @@ def search_minimum(
         jnp.zeros(p),
         jnp.zeros(()),
         jnp.asarray(jnp.inf),
+        jnp.asarray(1.0),
         jnp.asarray(LEAST_DAMPING),
         jnp.asarray(2.0),
         jnp.asarray(0),
