@@ -258,6 +258,7 @@ def one_pass(parameters: int) -> dict[str, Any]:
     from scipy.linalg.blas import dsyrk
 
     from gyromodel.estimate._blocks import BLOCK, Blocks, gram_of
+    from gyromodel.estimate._together import OPTIONS
 
     model = thermal_rate_model(parameters)
     record = next(campaigns(model, 1, (5120, 5120)))
@@ -266,7 +267,7 @@ def one_pass(parameters: int) -> dict[str, Any]:
     x = jnp.asarray(truth(model, np.random.default_rng(0)))
     weight, repeats = jnp.ones((1, blocks, BLOCK)), 200
 
-    @partial(jax.jit, compiler_options=former_fusions())
+    @partial(jax.jit, compiler_options=OPTIONS)
     def passes(x, signals, weight, used, count):
         data = Blocks(signals, weight, 0, used, None)
         gram = gram_of(model, data)
@@ -381,7 +382,8 @@ def _page(ragged, mine, loops, alike, exact, batches, passes, compiled, far) -> 
         "loop does not. Reading campaigns, with the smoothing of their thermometers, is not in it. Peers were measured "
         "on the first of the same campaigns, and have the same structured columns (but for the rows by `jacfwd`), "
         "compiled, and scaled parameters; scipy at its default tolerances, optimistix at 1e-8, and in one row with "
-        "parameters as the model holds them, unscaled.",
+        "parameters as the model holds them, unscaled. Iterations of `fit_many` are passes over all samples; before them "
+        "it looks at 512 of them.",
         "",
         *table(["parameters", "method", "wall ms", "processor ms", "ratio", "iterations"], rows),
         "",

@@ -20,6 +20,8 @@ from gyromodel.numerics.compiled_least_squares import Search, search_minimum
 from gyromodel.numerics.state_space import Sampling, build_filter
 from gyromodel.signals import Record
 
+# Vectors as wide as the processor has them: XLA by itself takes half of that.
+OPTIONS = former_fusions() and former_fusions() | {"xla_cpu_prefer_vector_width": 512}
 # Campaigns handed to the compiled program in one call.
 TOGETHER = 32
 # Distance from the minimum, in standard deviations of the parameters, at which a search ends with one more step.
@@ -163,7 +165,7 @@ def _stacked(each: Sequence[Any]) -> Any:
     )
 
 
-@partial(jax.jit, compiler_options=former_fusions())
+@partial(jax.jit, compiler_options=OPTIONS)
 def search(data: SideBySide, campaign, start, most, thin) -> tuple[Search, Float[Array, " task"], Bool[Array, " task"]]:
     """One search after the other, each of a campaign from a start.
 
@@ -207,5 +209,5 @@ def searches(
         campaign = np.array([i for i, _ in some] + [0] * lack)
         start = np.stack([x for _, x in some] + [some[0][1]] * lack)
         points = np.array([[most] * len(some) + [0] * lack, [thin] * len(some) + [0] * lack])
-        found.append(jax.tree.map(lambda v, n=len(some): np.asarray(v)[:n], search(data, campaign, start, *points)))
-    return jax.tree.map(lambda *parts: np.concatenate(parts), *found)
+        found.append(jax.tree.map(np.asarray, search(data, campaign, start, *points)))
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(tasks)], *found)

@@ -25,7 +25,7 @@ LINEAR_SHARE = 1e-4
 # Distance from the minimum, as a part of the cost, below which the rate of convergence is taken from the last step.
 CLOSE = 0.1
 # By how much more of the squared distance a step may leave than those before it did.
-SAFETY = 5.0
+SAFETY = 10.0
 
 
 class Search(NamedTuple):
