@@ -382,8 +382,8 @@ def _page(ragged, mine, loops, alike, exact, batches, passes, compiled, far) -> 
         "loop does not. Reading campaigns, with the smoothing of their thermometers, is not in it. Peers were measured "
         "on the first of the same campaigns, and have the same structured columns (but for the rows by `jacfwd`), "
         "compiled, and scaled parameters; scipy at its default tolerances, optimistix at 1e-8, and in one row with "
-        "parameters as the model holds them, unscaled. Iterations of `fit_many` are passes over all samples; before them "
-        "it looks at 512 of them.",
+        "parameters as the model holds them, unscaled. Iterations of `fit_many` are passes over all samples, after a "
+        "search on at most 512 of them.",
         "",
         *table(["parameters", "method", "wall ms", "processor ms", "ratio", "iterations"], rows),
         "",

@@ -33,8 +33,9 @@ def curve_columns(
 ) -> Float[Array, "sample column"]:
     """Powers 1…`powers` of (x − reference)/10, then max(x − breakpoint, 0) for each breakpoint."""
     u = (x - reference) / POWER_SCALE
-    hinges = jnp.maximum(x[:, None] - breakpoints, 0.0)
-    return jnp.concatenate([*(u[:, None] ** i for i in range(1, powers + 1)), hinges], axis=1)
+    columns = [u**i for i in range(1, powers + 1)]
+    columns += [jnp.maximum(x - breakpoints[j], 0.0) for j in range(breakpoints.shape[0])]
+    return jnp.stack(columns, axis=1)
 
 
 def check_curve(coefficients: Array, hinges: Array, breakpoints: Array) -> None:
