@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import threading
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -128,14 +128,14 @@ def fit_many(
     waiting: dict[Any, list[Waiting]] = {}
     compiled: dict[Any, threading.Event] = {}
     running: deque[Future[dict[int, _Fitted]]] = deque()
-    own = threading.local()
+    memory: defaultdict[int, Memory] = defaultdict(dict)  # of each thread
 
     def work(key: Any, campaigns: list[Waiting], first: bool) -> dict[int, _Fitted]:
         # The first of a kind compiles; the others wait for its program instead of compiling it too.
         if not first:
             compiled[key].wait()
         try:
-            return _fit_together(campaigns, key[0], restarts, vars(own))
+            return _fit_together(campaigns, key[0], restarts, memory[threading.get_ident()])
         finally:
             compiled[key].set()
 
@@ -184,7 +184,7 @@ def _fit_together(campaigns: list[Waiting], blocks: int, restarts: bool, memory:
     if tried:
         found, *_ = searches(data, tried, 1)
         p = found.x.shape[1]
-        looked = found.gram[:, p, p] - found.promise
+        looked = np.asarray(found.gram[:, p, p] - found.promise)
         for i in {i for i, _ in tried}:
             own = [(cost, k) for k, cost in enumerate(looked) if tried[k][0] == i and np.isfinite(cost)]
             chosen += [tried[k] for _, k in sorted(own)[:FOLLOWED]]
@@ -208,25 +208,26 @@ def _followed(
     if not tasks:
         return []
     found, expected, thinned = searches(data, tasks, MOST_ITERATIONS, MOST_ITERATIONS * thin)
-    p, freedom = found.x.shape[1], data.freedom[[i for i, _ in tasks]]
-    white = (found.gram[:, p, p] - found.promise) / freedom
+    x, gram = np.asarray(found.x), np.asarray(found.gram)
+    p, freedom = x.shape[1], data.freedom[[i for i, _ in tasks]]
+    white = (gram[:, p, p] - np.asarray(found.promise)) / freedom
     chi, limit = white / expected, 1.0 + BAD_FIT * np.sqrt(2.0 / freedom)
-    inverse, root, whole = _inverses(found.gram[:, :p, :p])
+    inverse, root, whole = _inverses(gram[:, :p, :p])
     slots, fits = campaigns[0].model.slots(), []
     for k, (i, _) in enumerate(tasks):
-        model, x, converged, iterations = campaigns[i].model, found.x[k], bool(found.converged[k]), found.iterations[k]
+        model, converged, iterations = campaigns[i].model, bool(found.converged[k]), int(found.iterations[k])
         lost = False
         try:
             if not np.isfinite(white[k]):
                 check_covariates(campaigns[i].record, model)
                 raise EstimateError("the model is not finite at its start values: give others")
-            lost = not converged or not _possible(model, slots, x)
+            lost = not converged or not _possible(model, slots, x[k])
             if lost:
-                checked_solution(model, x, converged, iterations)
+                checked_solution(model, x[k], converged, iterations)
             if not whole[k]:
                 # A root of JᵀJ stands for J, and what names the effects is the same.
                 unit_covariance(root[k], model)
-            fit = _Fitted(x, inverse[k] * white[k], white[k], chi[k], iterations, False, "")
+            fit = _Fitted(x[k], inverse[k] * white[k], white[k], chi[k], iterations, False, "")
         except ValueError as problem:
             fit = _failed(str(problem))._replace(chi=chi[k], iterations=iterations, lost=lost)
         fits.append(fit._replace(bad=bool(lost or chi[k] > limit[k]), thinned=bool(thinned[k])))

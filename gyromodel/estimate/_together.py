@@ -102,10 +102,11 @@ class SideBySide(NamedTuple):
 
 
 def side_by_side(campaigns: list[Waiting], blocks: int, memory: Memory) -> SideBySide:
-    """Arrays of a fixed size, whatever the number of campaigns: the first stands in for those that lack.
+    """Arrays of a fixed size, whatever the number of campaigns; the model of the first stands in where some lack.
 
-    They lie in `memory`, and are those of the campaigns before.
+    Samples lie in `memory`, where those of the campaigns before were; where some lack nothing is written.
     """
+    own = [c.record for c in campaigns]
     campaigns = [*campaigns, *campaigns[:1] * (TOGETHER - len(campaigns))]
     records = [c.record for c in campaigns]
 
@@ -117,21 +118,21 @@ def side_by_side(campaigns: list[Waiting], blocks: int, memory: Memory) -> SideB
             memory[key] = _aligned((TOGETHER, blocks, BLOCK), first.dtype)
         together = memory[key]
         flat = together.reshape(TOGETHER, -1)
-        for row, values, record in zip(flat, (first, *others), records, strict=True):
+        for row, values, record in zip(flat, (first, *others), own, strict=False):
             row[: record.rows] = values[: record.rows]
             row[record.rows :] = values[record.rows - 1] if beyond is None else beyond
         return together
 
-    signals = {name: padded(name, (r.signals[name] for r in records)) for name in records[0].signals}
-    weight = padded("_weight", (r.sampling.present / np.sqrt(r.sampling.white) for r in records), 0.0)
+    signals = {name: padded(name, (r.signals[name] for r in own)) for name in own[0].signals}
+    weight = padded("_weight", (r.sampling.present / np.sqrt(r.sampling.white) for r in own), 0.0)
     used = np.array([-(-r.rows // BLOCK) for r in records])
     noise = None
     if campaigns[0].ratios is not None:
         flat = (TOGETHER, blocks * BLOCK)
-        interval = padded("_interval", (r.sampling.interval for r in records)).reshape(flat)
-        restart = padded("_restart", (r.sampling.restart for r in records)).reshape(flat)
-        white = padded("_white", (r.sampling.white for r in records)).reshape(flat)
-        present = padded("_present", (r.sampling.present for r in records), 0.0).reshape(flat)
+        interval = padded("_interval", (r.sampling.interval for r in own)).reshape(flat)
+        restart = padded("_restart", (r.sampling.restart for r in own)).reshape(flat)
+        white = padded("_white", (r.sampling.white for r in own)).reshape(flat)
+        present = padded("_present", (r.sampling.present for r in own), 0.0).reshape(flat)
         ratios = [c.ratios for c in campaigns if c.ratios is not None]
         longest = [float(r.longest(record_span(record))) for r, record in zip(ratios, records, strict=True)]
         parts: list[Any] = [interval, restart, present, white]
