@@ -54,7 +54,7 @@ class ManyFits:
         white_variance: variance of the white noise of one sample, output unit squared.
         reduced_chi_squared: `white_variance` over the stated one; where none is stated over half the mean square of the
             residual's successive differences, which a wrong minimum leaves small.
-        iterations: points that the last search of a campaign looked at.
+        iterations: points that the last search of a campaign looked at, on all samples.
         converged: whether there is an estimate.
         bad: whether chi-squared is beyond chance, or no minimum was found, from the given start.
         restarted: whether other starts of the nonlinear parameters were tried.
