@@ -165,7 +165,7 @@ def scipy_loop(parameters: int, method: str, tight: bool = False, forward: bool 
     import jax
     from scipy.optimize import least_squares
 
-    from gyromodel.estimate._together import kind_of, ready
+    from gyromodel.estimate._together import described, kind_of, ready
 
     model = thermal_rate_model(parameters)
     start, size = np.asarray(model.vector()), _typical(model)
@@ -181,8 +181,8 @@ def scipy_loop(parameters: int, method: str, tight: bool = False, forward: bool 
             return jax.jacfwd(residual)(u, signals)
         return model.with_vector(u * size).linearise(signals)[1] * (size / (SIGMA * DEG_H))
 
-    given = np.asarray(model.vector())
-    lengths = [512 * kind_of(ready(0, r, model, given))[0] for r in records]
+    given = described(model)
+    lengths = [512 * kind_of(ready(0, r, given))[0] for r in records]
     padded = [
         {k: np.pad(v, (0, n - r.rows), mode="edge") for k, v in r.signals.items()}
         for r, n in zip(records, lengths, strict=True)
@@ -257,21 +257,22 @@ def one_pass(parameters: int) -> dict[str, Any]:
     import jax.numpy as jnp
     from scipy.linalg.blas import dsyrk
 
-    from gyromodel.estimate._blocks import BLOCK, Blocks, gram_and_roughness
+    from gyromodel.estimate._blocks import BLOCK, Blocks, gram_of
+    from gyromodel.estimate._together import OPTIONS
 
     model = thermal_rate_model(parameters)
     record = next(campaigns(model, 1, (5120, 5120)))
     blocks = 5120 // BLOCK
-    signals = {k: jnp.asarray(v).reshape(blocks, BLOCK) for k, v in record.signals.items()}
+    signals = {k: jnp.asarray(v).reshape(1, blocks, BLOCK) for k, v in record.signals.items()}
     x = jnp.asarray(truth(model, np.random.default_rng(0)))
-    weight, repeats = jnp.ones((blocks, BLOCK)), 200
+    weight, repeats = jnp.ones((1, blocks, BLOCK)), 200
 
-    @partial(jax.jit, compiler_options=former_fusions())
-    def passes(x, signals, weight, count):
-        data = Blocks(signals, weight, jnp.asarray(blocks), None)
-        gram = gram_and_roughness(model, data)[0]
+    @partial(jax.jit, compiler_options=OPTIONS)
+    def passes(x, signals, weight, used, count):
+        data = Blocks(signals, weight, 0, used, None)
+        gram = gram_of(model, data)
         # Each pass begins where the last one ended, as far as the compiler knows.
-        return jax.lax.fori_loop(0, count, lambda _, g: gram(x + 1e-300 * g[0, 0]), jnp.zeros((len(x) + 1,) * 2))
+        return jax.lax.fori_loop(0, count, lambda _, g: gram(x + 1e-300 * g[0, 0]), jnp.zeros((len(x) + 2,) * 2))
 
     columns = np.column_stack(model.with_vector(x).linearise(record.signals)).T
     stacked = np.asfortranarray(columns.T)
@@ -281,7 +282,7 @@ def one_pass(parameters: int) -> dict[str, Any]:
         return min(timed(work)[1]["cpu"] for _ in range(7)) / repeats
 
     floor = best(lambda: [dsyrk(1.0, stacked, trans=1) for _ in range(repeats)])
-    ours = best(lambda: passes(x, signals, weight, repeats).block_until_ready())
+    ours = best(lambda: passes(x, signals, weight, blocks, repeats).block_until_ready())
     return {"ours": ours, "floor": floor}
 
 
@@ -290,11 +291,12 @@ def compiling(parameters: int) -> dict[str, Any]:
     from gyromodel.estimate import _together
 
     model = thermal_rate_model(parameters)
-    start = np.asarray(model.vector())
+    given = _together.described(model)
     records = campaigns(model, _together.TOGETHER, (6000, 6500))
-    waiting = [_together.ready(i, r, model, start) for i, r in enumerate(records)]
-    data = _together.side_by_side(waiting, 16)
-    tasks = np.arange(_together.TOGETHER), np.stack([c.start for c in waiting]), np.full(_together.TOGETHER, 100)
+    waiting = [_together.ready(i, r, given) for i, r in enumerate(records)]
+    data = _together.side_by_side(waiting, 16, {})
+    points = np.full((2, _together.TOGETHER), 100)
+    tasks = np.arange(_together.TOGETHER), np.stack([c.start for c in waiting]), *points
     before = time.perf_counter()
     lowered = _together.search.lower(data, *tasks)
     traced = time.perf_counter()
@@ -380,7 +382,8 @@ def _page(ragged, mine, loops, alike, exact, batches, passes, compiled, far) -> 
         "loop does not. Reading campaigns, with the smoothing of their thermometers, is not in it. Peers were measured "
         "on the first of the same campaigns, and have the same structured columns (but for the rows by `jacfwd`), "
         "compiled, and scaled parameters; scipy at its default tolerances, optimistix at 1e-8, and in one row with "
-        "parameters as the model holds them, unscaled.",
+        "parameters as the model holds them, unscaled. Iterations of `fit_many` are passes over all samples, after a "
+        "search on at most 512 of them.",
         "",
         *table(["parameters", "method", "wall ms", "processor ms", "ratio", "iterations"], rows),
         "",

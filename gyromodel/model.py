@@ -129,8 +129,8 @@ class GyroModel(eqx.Module):
 
     def prepared(self, signals: Signals) -> GyroModel:
         """Reference points and start values that depend on the campaign filled in."""
-        self.check_columns(signals)
-        # Asked of the class: equinox would make an object for each method of an effect, ten times the work of most.
+        # Asked of the class: equinox would make an object for each method, ten times the work of most.
+        GyroModel.check_columns(self, signals)
         effects = tuple(type(e).prepared(e, signals) for e in self.effects)
         if all(a is b for a, b in zip(effects, self.effects, strict=True)):
             return self

@@ -92,30 +92,78 @@ def test_values_are_those_of_single_fits_at_every_length(
         assert np.asarray(fits.model(i).vector()) == pytest.approx(fits.values[i])
 
 
-def test_values_are_scipys_on_the_equation(rng: np.random.Generator):
-    records = [campaign(rng, rows) for rows in (300, 450)]
+def from_scipy(record: Record) -> tuple[np.ndarray, np.ndarray]:
+    """Values and standard deviations by scipy, at tolerances of its rounding."""
+    c = {k: np.asarray(v)[: record.rows] for k, v in record.signals.items()}
+    c, output = c | {"rate": c["rate"] / DEG_H}, c["output"] / DEG_H
+    limits = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15}
+    found = least_squares(lambda x: equation(x, c) - output, TRUTH, jac="cs", x_scale="jac", **limits)
+    covariance = np.linalg.inv(found.jac.T @ found.jac) * 2 * found.cost / (record.rows - len(TRUTH))
+    return found.x, np.sqrt(np.diag(covariance))
+
+
+@pytest.mark.parametrize("rows", [(300, 450), (1600, 2300, 5000)])
+def test_values_are_scipys_on_the_equation(rows: tuple[int, ...], rng: np.random.Generator):
+    """The longer ones begin on a sample of their rows."""
+    records = [campaign(rng, count) for count in rows]
     fits = fit_many(records, thermal_model())
+    assert not fits.restarted.any()
     for i, record in enumerate(records):
-        c = {k: np.asarray(v)[: record.rows] for k, v in record.signals.items()}
-        c, output = c | {"rate": c["rate"] / DEG_H}, c["output"] / DEG_H
-        limits = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15}
-        found = least_squares(lambda x, c=c, o=output: equation(x, c) - o, TRUTH, jac="cs", x_scale="jac", **limits)
-        covariance = np.linalg.inv(found.jac.T @ found.jac) * 2 * found.cost / (record.rows - len(TRUTH))
-        std = np.sqrt(np.diag(covariance))
-        assert np.abs((fits.values[i] / UNITS - found.x) / std).max() < 1e-4
+        values, std = from_scipy(record)
+        assert np.abs((fits.values[i] / UNITS - values) / std).max() < 1e-4
         assert fits.std[i] / UNITS == pytest.approx(std, rel=1e-3)
+
+
+def test_searches_end_where_scipy_does_however_weak_an_effect_is(rng: np.random.Generator):
+    """A warm-up of a few standard deviations: the rate of convergence by which a search ends is at its worst."""
+    base = campaign(rng, 2100)
+    signals = {k: np.asarray(v) for k, v in base.signals.items()}
+    c = signals | {"rate": signals["rate"] / DEG_H}
+    records = []
+    for amplitude in rng.uniform(0.1, 0.5, 40):
+        output = equation(TRUTH * [1, 1, 1, amplitude / TRUTH[3], 1], c) + SIGMA * rng.standard_normal(len(c["rate"]))
+        records.append(base._replace(signals={**base.signals, "output": jnp.asarray(output * DEG_H)}))
+    fits = fit_many(records, thermal_model())
+    assert fits.converged.all()
+    for i, record in enumerate(records):
+        values, std = from_scipy(record)
+        assert np.abs((fits.values[i] / UNITS - values) / std).max() < 1e-4
+
+
+def test_a_sample_that_leads_astray_is_left(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch):
+    """To a time constant of a thousandth of a sample, from where no slope leads back."""
+    whole = _together.search_minimum
+
+    def astray(gram, start, linear, tolerance, most, *solved):
+        found = whole(gram, start, linear, tolerance, most, *solved)
+        return found if solved else found._replace(x=start.at[-1].set(0.01), converged=jnp.asarray(most > 0))
+
+    records = [campaign(rng, 2100)]
+    right = fit_many(records, thermal_model())
+    monkeypatch.setattr(_together, "search_minimum", astray)
+    _together.search.clear_cache()
+    try:
+        data = _together.side_by_side([_together.ready(0, records[0], _together.described(thermal_model()))], 8, {})
+        found, _, thinned = _together.searches(data, [(0, np.asarray(thermal_model().vector()))], 100, 100)
+        fits = fit_many(records, thermal_model(), restarts=False)
+    finally:
+        _together.search.clear_cache()
+    assert thinned.all()
+    assert abs(found.x[0, -1] / TRUTH[-1] - 1) > 0.5
+    assert not fits.bad.any()
+    assert np.abs((fits.values - right.values) / right.std).max() < 1e-4
 
 
 def test_one_trace_for_each_power_of_two_of_lengths(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch):
     traces: list[int] = []
     _together.search.clear_cache()
-    whole = _together.gram_and_roughness
+    whole = _together.gram_of
 
     def counted(model, data):
-        traces.append(data.weight.shape[0])
+        traces.append(data.weight.shape[1])
         return whole(model, data)
 
-    monkeypatch.setattr(_together, "gram_and_roughness", counted)
+    monkeypatch.setattr(_together, "gram_of", counted)
     base = [campaign(rng, rows) for rows in (200, 400, 600)]
     records = [again(base[i % 3], rng) for i in range(70)]
     fit_many(records, thermal_model(), threads=3)
@@ -156,9 +204,10 @@ def test_a_generator_of_no_campaigns_gives_none():
     assert fits.reasons == []
 
 
-def test_a_false_minimum_is_seen_and_left(rng: np.random.Generator):
+@pytest.mark.parametrize("rows", [500, 2100])
+def test_a_false_minimum_is_seen_and_left(rows: int, rng: np.random.Generator):
     """From a time constant of a thousandth of a sample the warm-up has no slope to follow, and chi-squared tells."""
-    base = campaign(rng, 500)
+    base = campaign(rng, rows)
     records = [again(base, rng) for _ in range(4)]
     stuck = fit_many(records, thermal_model(0.01), restarts=False)
     assert not stuck.restarted.any()

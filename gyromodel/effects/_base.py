@@ -200,7 +200,9 @@ class Effect(eqx.Module):
 
             def moved(v, name=name, value=value):
                 changed = eqx.tree_at(lambda e: getattr(e, name), self, jnp.reshape(v, jnp.shape(value)))
-                return changed.contribution(signals)
+                # Not a product of matrices, for which the compiler would put the columns together twice.
+                columns = changed.columns(signals)
+                return sum((a * columns[:, i] for i, a in enumerate(changed.linear())), jnp.zeros(len(columns)))
 
             for direction in jnp.eye(jnp.size(value)):
                 derivatives.append(jax.jvp(moved, (jnp.ravel(value),), (direction,))[1])

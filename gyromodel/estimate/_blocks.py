@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax.scipy.linalg import block_diag
+from jaxtyping import Array, Bool, Float
 
 from gyromodel.effects import Effect, Signals
 from gyromodel.model import GyroModel
@@ -27,41 +28,53 @@ Rows = tuple[Float[Array, "*block coefficient sample"], Float[Array, "*block sha
 
 
 class Blocks(NamedTuple):
-    """A campaign's samples in blocks, or many campaigns' with one axis more.
+    """A campaign's samples in blocks, among those of others.
 
-    Of signals and `weight` the axes are block and sample. `weight` is one over the white noise relative to its unit,
-    zero where there is no sample; `used` counts the blocks that hold samples; with `filter` the noise is coloured.
+    Of signals and `weight` the axes are campaign, block and sample. `weight` is one over the white noise relative to
+    its unit, zero where there is no sample; `used` counts the blocks of this campaign that hold samples; with `filter`,
+    its own, the noise is coloured.
     """
 
     signals: Mapping[str, Any]
     weight: Any
+    campaign: Any
     used: Any
     filter: Filter | None
 
+    def part(self, block: Any) -> tuple[dict[str, Any], Any]:
+        """Signals and weight of one block."""
+        return {name: v[self.campaign, block] for name, v in self.signals.items()}, self.weight[self.campaign, block]
 
-Known = Mapping[int, Rows]
+    def thinnable(self, model: GyroModel) -> bool:
+        """Whether samples may be left out."""
+        return self.filter is None and self.weight.shape[1] >= 4 and not any(e.remembers for e in model.effects)
+
+    def thinned(self) -> Blocks:
+        """One block, of one sample out of as many as there are blocks, by chance, as regular ones may fit a period."""
+        every = self.weight.shape[1]
+        chosen = every * np.arange(BLOCK) + np.random.default_rng(0).integers(every, size=BLOCK)
+        places = self.campaign, *np.divmod(chosen, BLOCK)
+        signals, weight = jax.tree.map(lambda values: values[places][None, None], (self.signals, self.weight))
+        return Blocks(signals, weight, 0, jnp.minimum(self.used, 1), None)
+
+
 Vector = Float[Array, " parameter"]
 
 
-def gram_and_roughness(
-    model: GyroModel, data: Blocks
-) -> tuple[Callable[[Vector], Float[Array, "column column"]], Callable[[Vector], Float[Array, ""]]]:
-    """Two functions of the free parameters; rows that no nonlinear parameter shapes are computed once for both.
+def gram_of(model: GyroModel, data: Blocks) -> Callable[[Vector], Float[Array, "column column"]]:
+    """[J, r]ᵀ[J, r] of the whitened residual r as a function of the free parameters, one more row and column behind it.
 
-    Returns:
-        [J, r]ᵀ[J, r] of the whitened residual r; and half the mean square of the successive differences of the weighted
-        residual, which is the variance of its white part.
+    In these the sum of squares of r's successive differences within blocks stands by itself. Rows that no nonlinear
+    parameter shapes are computed once.
     """
     free = _free(model)
-
-    present = data.weight > 0
 
     def rows_of(effect: Effect, names: tuple[str, ...]) -> Rows:
         """Zero where there is no sample, and what is read there may not be a number."""
         if effect.remembers:  # it looks at neighbouring samples, and must see all of them
-            whole = {name: values.ravel() for name, values in data.signals.items()}
+            whole = {name: values[data.campaign].ravel() for name, values in data.signals.items()}
             rows = jax.tree.map(_in_blocks, _rows(effect, whole, names))
-            return jax.tree.map(lambda values: jnp.where(present[:, None], values, 0.0), rows)
+            return jax.tree.map(lambda values: jnp.where(data.weight[data.campaign][:, None] > 0, values, 0.0), rows)
         return _over_blocks(lambda part: _rows(effect, part, names), data)
 
     steady = {
@@ -70,59 +83,53 @@ def gram_and_roughness(
         if effect.site not in LATER and not _shaped(effect, free.get(i, ()))
     }
 
-    def at(x: Vector) -> tuple[GyroModel, Known]:
-        """The model and its rows, before they are multiplied by what they act on.
-
-        In a loop of their own: the compiler would compute an exponential again for each row that contains it.
-        """
-        now = model.with_vector(x)
-        others = {i: rows_of(e, free[i]) for i, e in enumerate(now.effects) if e.site not in LATER and i not in steady}
-        return now, steady | others
-
     def gram(x: Vector) -> Float[Array, "column column"]:
-        now, known = at(x)
+        now = model.with_vector(x)
+        others = {i: e for i, e in enumerate(now.effects) if e.site not in LATER and i not in steady}
+        known = steady | {i: rows_of(e, free[i]) for i, e in others.items() if e.remembers}
 
         def add(block, carry):
-            state, total = carry
-            part = jax.tree.map(lambda values: values[block], (data.signals, data.weight, known, data.filter))
-            signals, weight, rows, filter = part
+            state, total, rough = carry
+            signals, weight = data.part(block)
+            rows, filter = jax.tree.map(lambda values: values[block], (known, data.filter))
+
+            def shaped():
+                found = {i: _rows(e, signals, free[i]) for i, e in others.items() if not e.remembers}
+                return jax.tree.map(lambda values: jnp.where(weight > 0, values, 0.0), found)
+
+            # Under a condition that always holds: the compiler would compute an exponential again for each row with it.
+            nothing = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(shaped))
+            rows = rows | jax.lax.cond(block < data.used, shaped, lambda: nothing)
             stacked = _stacked(now, signals, rows, free, weight if filter is None else jnp.sign(weight))
             if filter is not None:
                 state, white = whiten_on(state, filter, stacked.T)
                 stacked = white.T
-            return state, total + stacked @ stacked.T
+            rough += jnp.sum(jnp.where(in_turn(weight), jnp.diff(stacked[-1]), 0.0) ** 2)
+            return state, total + stacked @ stacked.T, rough
 
         width = x.shape[0] + 1
         state = jnp.zeros(0)
         if data.filter is not None:
             state = at_rest(jax.tree.map(lambda values: values[0], data.filter), width)
-        return jax.lax.fori_loop(0, data.used, add, (state, jnp.zeros((width, width))))[1]
+        _, total, rough = jax.lax.fori_loop(0, data.used, add, (state, jnp.zeros((width, width)), jnp.zeros(())))
+        return block_diag(total, rough)
 
-    def roughness(x: Vector) -> Float[Array, ""]:
-        now, known = at(x)
+    return gram
 
-        def add(block, carry):
-            signals, weight, rows = jax.tree.map(lambda values: values[block], (data.signals, data.weight, known))
-            change = jnp.diff(_stacked(now, signals, rows, free, weight)[-1])
-            both = (weight[1:] > 0) & (weight[:-1] > 0)
-            return carry[0] + jnp.sum(jnp.where(both, change, 0.0) ** 2), carry[1] + both.sum()
 
-        squares, pairs = jax.lax.fori_loop(0, data.used, add, (jnp.zeros(()), jnp.zeros((), int)))
-        return squares / 2.0 / jnp.maximum(pairs, 1)
-
-    return gram, roughness
+def in_turn(weight: Float[Array, "*block sample"]) -> Bool[Array, "*block pair"]:
+    """Which samples and those after them in their block are both there."""
+    return (weight[..., 1:] > 0) & (weight[..., :-1] > 0)
 
 
 def _over_blocks(rows: Callable[[Signals], Rows], data: Blocks) -> Rows:
     """Rows of every block that holds samples, zeros elsewhere."""
-    shapes = jax.eval_shape(rows, {name: values[0] for name, values in data.signals.items()})
-    blocks = data.weight.shape[0]
+    shapes = jax.eval_shape(lambda: rows(data.part(0)[0]))
+    blocks = data.weight.shape[1]
 
     def put(block, found):
-        part = rows({name: values[block] for name, values in data.signals.items()})
-        return jax.tree.map(
-            lambda all, one: all.at[block].set(jnp.where(data.weight[block] > 0, one, 0.0)), found, part
-        )
+        signals, weight = data.part(block)
+        return jax.tree.map(lambda all, one: all.at[block].set(jnp.where(weight > 0, one, 0.0)), found, rows(signals))
 
     return jax.lax.fori_loop(0, data.used, put, jax.tree.map(lambda s: jnp.zeros((blocks, *s.shape), s.dtype), shapes))
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import itertools
 import os
 import threading
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from copy import copy
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -19,9 +19,18 @@ from jaxtyping import Bool, Float, Int
 from gyromodel.effects import Effect, Signals
 from gyromodel.estimate._estimate import EstimateError
 from gyromodel.estimate._fit import SINGULAR, check_covariates, checked_solution, unit_covariance
-from gyromodel.estimate._together import TOGETHER, Waiting, kind_of, ready, searches, side_by_side
+from gyromodel.estimate._together import (
+    TOGETHER,
+    Memory,
+    SideBySide,
+    Waiting,
+    described,
+    kind_of,
+    ready,
+    searches,
+    side_by_side,
+)
 from gyromodel.model import GyroModel, Slot
-from gyromodel.numerics.compiled_least_squares import Search
 from gyromodel.signals import Record
 from gyromodel.units import factor, internal_unit
 
@@ -45,7 +54,7 @@ class ManyFits:
         white_variance: variance of the white noise of one sample, output unit squared.
         reduced_chi_squared: `white_variance` over the stated one; where none is stated over half the mean square of the
             residual's successive differences, which a wrong minimum leaves small.
-        iterations: points that the last search of a campaign looked at.
+        iterations: points that the last search of a campaign looked at, on all samples.
         converged: whether there is an estimate.
         bad: whether chi-squared is beyond chance, or no minimum was found, from the given start.
         restarted: whether other starts of the nonlinear parameters were tried.
@@ -83,6 +92,7 @@ class _Fitted(NamedTuple):
     reason: str
     lost: bool = False  # no minimum was found, or one that cannot be
     bad: bool = False
+    thinned: bool = False  # the search began at the minimum of a sample of the rows
 
 
 def fit_many(
@@ -111,18 +121,21 @@ def fit_many(
         raise EstimateError("JAX runs in single precision; import gyromodel before using jax, or set JAX_ENABLE_X64=1")
     threads = threads or _processors()
     prepared: list[GyroModel] = []
-    given = np.asarray(model.vector())
+    # Prepared for each campaign, it is asked for its numbers, which takes longer of arrays of JAX.
+    model = jax.tree.map(np.asarray, model)
+    given = described(model)
     done: dict[int, _Fitted] = {}
     waiting: dict[Any, list[Waiting]] = {}
     compiled: dict[Any, threading.Event] = {}
     running: deque[Future[dict[int, _Fitted]]] = deque()
+    memory: defaultdict[int, Memory] = defaultdict(dict)  # of each thread
 
     def work(key: Any, campaigns: list[Waiting], first: bool) -> dict[int, _Fitted]:
         # The first of a kind compiles; the others wait for its program instead of compiling it too.
         if not first:
             compiled[key].wait()
         try:
-            return _fit_together(campaigns, key[0], restarts)
+            return _fit_together(campaigns, key[0], restarts, memory[threading.get_ident()])
         finally:
             compiled[key].set()
 
@@ -138,7 +151,7 @@ def fit_many(
         for place, record in enumerate(records):
             prepared.append(model)
             try:
-                campaign = ready(place, record, model, given)
+                campaign = ready(place, record, given)
             except ValueError as problem:
                 done[place] = _failed(str(problem))
                 continue
@@ -158,72 +171,98 @@ def _processors() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _fit_together(campaigns: list[Waiting], blocks: int, restarts: bool) -> dict[int, _Fitted]:
-    data, slots = side_by_side(campaigns, blocks), campaigns[0].model.slots()
-    first = searches(data, [(i, c.start) for i, c in enumerate(campaigns)], MOST_ITERATIONS)
-    fitted = [_finish(c, slots, *found) for c, found in zip(campaigns, first, strict=True)]
-    limit = 1.0 + BAD_FIT * np.sqrt(2.0 / data.freedom)
-    fitted = [f._replace(bad=f.lost or f.chi > most) for f, most in zip(fitted, limit, strict=False)]
+def _fit_together(campaigns: list[Waiting], blocks: int, restarts: bool, memory: Memory) -> dict[int, _Fitted]:
+    data, starts = side_by_side(campaigns, blocks, memory), [(i, c.start) for i, c in enumerate(campaigns)]
+    fitted = _followed(campaigns, data, starts, thin=True)
+    # The minimum of a sample of the rows can lead astray.
+    again = [starts[i] for i, fit in enumerate(fitted) if fit.bad and fit.thinned]
+    for (i, _), other in zip(again, _followed(campaigns, data, again), strict=True):
+        fitted[i] = _better(other, fitted[i])
     bad = [i for i, fit in enumerate(fitted) if fit.bad]
     tried = [(i, x) for i in bad if restarts for x in _starts(campaigns[i].model, campaigns[i].record.signals)]
-    looked = [found.cost - found.promise for found, _ in searches(data, tried, 1)]
-    followed = []
-    for i in {i for i, _ in tried}:
-        own = [(cost, k) for k, cost in enumerate(looked) if tried[k][0] == i and np.isfinite(cost)]
-        followed += [tried[k] for _, k in sorted(own)[:FOLLOWED]]
-    for (i, _), found in zip(followed, searches(data, followed, MOST_ITERATIONS), strict=True):
-        other = _finish(campaigns[i], slots, *found)
-        better = not other.reason and (fitted[i].reason or other.white < fitted[i].white)
-        fitted[i] = (other if better else fitted[i])._replace(restarted=True, bad=True)
+    chosen = []
+    if tried:
+        found, *_ = searches(data, tried, 1)
+        p = found.x.shape[1]
+        looked = np.asarray(found.gram[:, p, p] - found.promise)
+        for i in {i for i, _ in tried}:
+            own = [(cost, k) for k, cost in enumerate(looked) if tried[k][0] == i and np.isfinite(cost)]
+            chosen += [tried[k] for _, k in sorted(own)[:FOLLOWED]]
+    for (i, _), other in zip(chosen, _followed(campaigns, data, chosen), strict=True):
+        fitted[i] = _better(other, fitted[i])._replace(restarted=True, bad=True)
     return {c.place: fit for c, fit in zip(campaigns, fitted, strict=True)}
+
+
+def _better(one: _Fitted, other: _Fitted) -> _Fitted:
+    return one if not one.reason and (other.reason or one.white < other.white) else other
 
 
 def _failed(reason: str) -> _Fitted:
     return _Fitted(np.zeros(0), np.zeros((0, 0)), np.nan, np.nan, 0, False, reason)
 
 
-def _finish(campaign: Waiting, slots: Sequence[Slot], found: Search, expected: float) -> _Fitted:
-    """The estimate where a search ended, or why there is none."""
-    record, model, x, iterations = campaign.record, campaign.model, np.asarray(found.x), int(found.iterations)
-    white = float(found.cost - found.promise) / float(record.present.sum() - len(x))
-    chi = white / float(expected) if np.isfinite(white) else np.nan
-    lost = False
-    try:
-        if not np.isfinite(found.cost):
-            check_covariates(record, model)
-            raise EstimateError("the model is not finite at its start values: give others")
-        lost = not found.converged or not _possible(model, slots, x)
-        if lost:
-            checked_solution(model, x, bool(found.converged), iterations)
-        covariance = _inverse(np.asarray(found.information), model) * white
-    except ValueError as problem:
-        return _failed(str(problem))._replace(chi=chi, iterations=iterations, lost=lost)
-    return _Fitted(x, covariance, white, chi, iterations, False, "")
+def _followed(
+    campaigns: list[Waiting], data: SideBySide, tasks: Sequence[tuple[int, np.ndarray]], thin: bool = False
+) -> list[_Fitted]:
+    """The estimates where searches end, or why there is none."""
+    if not tasks:
+        return []
+    found, expected, thinned = searches(data, tasks, MOST_ITERATIONS, MOST_ITERATIONS * thin)
+    x, gram = np.asarray(found.x), np.asarray(found.gram)
+    p, freedom = x.shape[1], data.freedom[[i for i, _ in tasks]]
+    white = (gram[:, p, p] - np.asarray(found.promise)) / freedom
+    chi, limit = white / expected, 1.0 + BAD_FIT * np.sqrt(2.0 / freedom)
+    inverse, root, whole = _inverses(gram[:, :p, :p])
+    slots, fits = campaigns[0].model.slots(), []
+    for k, (i, _) in enumerate(tasks):
+        model, converged, iterations = campaigns[i].model, bool(found.converged[k]), int(found.iterations[k])
+        lost = False
+        try:
+            if not np.isfinite(white[k]):
+                check_covariates(campaigns[i].record, model)
+                raise EstimateError("the model is not finite at its start values: give others")
+            lost = not converged or not _possible(model, slots, x[k])
+            if lost:
+                checked_solution(model, x[k], converged, iterations)
+            if not whole[k]:
+                # A root of JᵀJ stands for J, and what names the effects is the same.
+                unit_covariance(root[k], model)
+            fit = _Fitted(x[k], inverse[k] * white[k], white[k], chi[k], iterations, False, "")
+        except ValueError as problem:
+            fit = _failed(str(problem))._replace(chi=chi[k], iterations=iterations, lost=lost)
+        fits.append(fit._replace(bad=bool(lost or chi[k] > limit[k]), thinned=bool(thinned[k])))
+    return fits
 
 
-def _inverse(information: np.ndarray, model: GyroModel) -> np.ndarray:
-    """(JᵀJ)⁻¹; refuses directions that the data do not determine, as far as JᵀJ can tell in its rounding."""
-    size = np.sqrt(np.diag(information))
+def _inverses(information: Float[np.ndarray, "task p p"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(JᵀJ)⁻¹, roots of JᵀJ, and whether the data determine all directions, as far as JᵀJ can tell in its rounding."""
+    p = information.shape[1]
+    finite = np.isfinite(information).all(axis=(1, 2), keepdims=True)
+    information = np.where(finite, information, np.eye(p))
+    size = np.sqrt(np.einsum("tpp->tp", information))[:, None]
     size[size == 0] = 1.0
-    values, vectors = np.linalg.eigh(information / np.outer(size, size))
-    lost = max(SINGULAR**2, len(size) * np.finfo(float).eps) * values.max(initial=0.0)
-    if (values <= lost).any():
-        # A root of JᵀJ stands for J, and what names the effects is the same.
-        unit_covariance(np.sqrt(np.where(values > lost, values, 0.0))[:, None] * vectors.T * size, model)
-    vectors = vectors / size[:, None]
-    return (vectors / values) @ vectors.T
+    values, vectors = np.linalg.eigh(information / (size * size.swapaxes(1, 2)))
+    values, rows = values[:, :, None], vectors.swapaxes(1, 2)
+    known = values > max(SINGULAR**2, p * np.finfo(float).eps) * values.max(axis=1, keepdims=True, initial=0.0)
+    values, scaled = np.where(known, values, 0.0), rows / size
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = scaled.swapaxes(1, 2) @ (scaled / values)
+    return inverse, np.sqrt(values) * rows * size, known.all(axis=(1, 2))
 
 
 def _possible(model: GyroModel, slots: Sequence[Slot], x: np.ndarray) -> bool:
     """Whether no nonlinear parameter has left what its effect can be."""
     changed: dict[int, Effect] = {}
     for slot, value in zip(slots, x, strict=True):
-        if not slot.linear:
-            effect = changed.setdefault(slot.effect, copy(model.effects[slot.effect]))
-            values = np.array(getattr(effect, slot.field))
-            values.flat[slot.index] = value
-            # A new effect with arrays of JAX would take longer than its part of the fit.
-            vars(effect)[slot.field] = values
+        if slot.linear:
+            continue
+        if slot.effect not in changed:
+            # A new effect made as usual, with arrays of JAX, would take longer than its part of the fit.
+            changed[slot.effect] = object.__new__(type(model.effects[slot.effect]))
+            vars(changed[slot.effect]).update(vars(model.effects[slot.effect]))
+        fields = vars(changed[slot.effect])
+        fields[slot.field] = np.array(fields[slot.field])
+        fields[slot.field].flat[slot.index] = value
     try:
         for effect in changed.values():
             for kind in type(effect).__mro__:

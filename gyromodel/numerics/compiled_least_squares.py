@@ -22,14 +22,17 @@ LEAST_PIVOT = 1e-14
 ROUNDING = 1e-13
 # Part of the damping that what is linear gets: alone it would need none, and products of it need some.
 LINEAR_SHARE = 1e-4
+# Distance from the minimum, as a part of the cost, below which the rate of convergence is taken from the last step.
+CLOSE = 0.1
+# By how much more of the squared distance a step may leave than those before it did.
+SAFETY = 10.0
 
 
 class Search(NamedTuple):
-    """Where a search ended: the point, the cost there, JᵀJ, and the decrease that its next step promises."""
+    """Where a search ended: the point, `gram` there, and the decrease of the cost that its next step promises."""
 
     x: Float[Array, " parameter"]
-    cost: Float[Array, ""]
-    information: Float[Array, "parameter parameter"]
+    gram: Float[Array, "column column"]
     promise: Float[Array, ""]
     iterations: Int[Array, ""]
     converged: Bool[Array, ""]
@@ -41,6 +44,8 @@ class _State(NamedTuple):
     scale: Float[Array, " parameter"]
     step: Float[Array, " parameter"]
     promise: Float[Array, ""]
+    distance: Float[Array, ""]
+    part: Float[Array, ""]
     damping: Float[Array, ""]
     growth: Float[Array, ""]
     iteration: Int[Array, ""]
@@ -54,23 +59,25 @@ def search_minimum(
     linear: Bool[Array | np.ndarray, " parameter"],
     tolerance: Float[Array, ""] | float,
     most: Int[Array, ""] | int,
+    solved: Bool[Array, ""] | bool = False,
 ) -> Search:
     """Minimise |r(x)|², with one exact solve for the linear parameters at the start.
 
     Args:
-        gram: [J, r]ᵀ[J, r] at a point, J the derivative of r.
+        gram: [J, r]ᵀ[J, r] at a point, J the derivative of r; rows and columns behind are the caller's own.
         start: where to begin.
         linear: which parameters r is linear in.
         tolerance: decrease of the cost, as a part of it, that still counts.
         most: points looked at, rejected ones and the start included; with one, `promise` is what the linear solve would
             gain; with none, nothing is computed.
+        solved: whether the start is so near that it needs no linear solve.
 
     Returns:
         The last step of a search that converged is taken without looking at where it leads.
     """
     p = start.shape[0]
     tolerance = jnp.maximum(tolerance, ROUNDING)
-    held = ~jnp.asarray(linear) & jnp.any(linear)
+    held = ~jnp.asarray(linear) & jnp.any(linear) & ~jnp.asarray(solved)
 
     def metric(scale):
         """What the damping multiplies; a long step of what is linear is no danger."""
@@ -101,7 +108,11 @@ def search_minimum(
         # A damped step may be short far from the minimum; what the whole one promises tells how far it is.
         whole = -solve_positive(a, g, jnp.zeros(p, bool))
         least = tolerance * cost_now
-        near = -g @ whole <= least
+        distance = -g @ whole
+        # What the next step will leave of the distance is told from what the last two left: one by itself may have been
+        # lucky, or have taken away what is linear.
+        part = jnp.where(better & (state.distance <= CLOSE * cost_now), distance / state.distance, 1.0)
+        near = jnp.minimum(SAFETY * jnp.sqrt(part * state.part), 1.0) * distance <= least
         # Where damping has made every step short: at the minimum the residual is orthogonal to every column, or the
         # last step cost or gained next to nothing, as where the cost has a kink.
         short = (promise <= least) & ~(first & held.any())
@@ -114,6 +125,8 @@ def search_minimum(
             scale,
             jnp.where(near, whole, step),
             promise,
+            distance,
+            part,
             damping,
             growth,
             state.iteration + 1,
@@ -121,13 +134,15 @@ def search_minimum(
             near | (short & (orthogonal | kink)),
         )
 
-    nothing = jnp.full((p + 1, p + 1), jnp.inf)
+    nothing = jnp.full(jax.eval_shape(gram, start).shape, jnp.inf)
     begin = _State(
         start,
         nothing,
         jnp.zeros(p),
         jnp.zeros(p),
         jnp.zeros(()),
+        jnp.asarray(jnp.inf),
+        jnp.asarray(1.0),
         jnp.asarray(LEAST_DAMPING),
         jnp.asarray(2.0),
         jnp.asarray(0),
@@ -137,7 +152,7 @@ def search_minimum(
     end = jax.lax.while_loop(lambda s: ~s.ended & (s.iteration < most), look, begin)
     polished = end.converged & jnp.isfinite(end.step).all()
     x = jnp.where(polished, end.x + end.step, end.x)
-    return Search(x, end.gram[p, p], end.gram[:p, :p], end.promise, end.iteration, end.converged)
+    return Search(x, end.gram, end.promise, end.iteration, end.converged)
 
 
 def solve_positive(
