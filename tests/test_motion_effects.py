@@ -236,6 +236,20 @@ def test_delay_and_lag_are_one_to_first_order_and_two_beyond():
     assert delay.value == pytest.approx(20.0, abs=6 * delay.std)
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("effect", ["time_delay", "bandwidth"])
+def test_what_is_late_by_many_samples_is_found_beside_a_gain_of_the_wrong_sign(effect: str):
+    """Ten samples of delay, or twenty of lag: in coloured noise the fit without it has the output turn the other way."""
+    late, noise = {"time_delay": (0.1, "flicker_and_walk"), "bandwidth": (0.2, "white")}[effect]
+    built = study.build(study.Case(1, "dynamic_rates", noise, effect, 150.0))
+    assert built.truth.amplitude == pytest.approx(late, rel=0.5)
+    campaign = Campaign(built.columns, built.units, built.metadata)
+    found = gyromodel.diagnose(campaign, model_from_effects(built.truth.baseline), hold_out=False)
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", [effect])
+    last = found.causes[0].parameters[-1]
+    assert 1e-3 * last.value == pytest.approx(built.truth.amplitude, abs=6e-3 * last.std)
+
+
 PLAN = """
 gyro: rig
 kind: rate
