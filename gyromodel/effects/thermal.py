@@ -67,7 +67,7 @@ class BiasTemperatureCurve(OverTemperature):
 
 
 class BiasTemperatureRate(Effect):
-    """E += D_Ṫ dT/dt: the Shupe effect."""
+    """E += D_Ṫ dT/dt: the Shupe effect; T of the place that `thermometer` names, else `temperature`."""
 
     id = "bias_temperature_rate"
     site = "rate"
@@ -77,9 +77,26 @@ class BiasTemperatureRate(Effect):
 
     coefficient: Float[Array, ""] = parameter("deg/h/(degC/s)", 1000.0, "bias per unit of temperature rate")
 
+    thermometer: str = eqx.field(static=True, default="", kw_only=True)
+
+    def __check_init__(self) -> None:
+        if not thermometers(self.columns_needed):
+            raise ValueError("thermometer takes the name of one, temperature or temperature_<place>")
+
+    @property
+    def columns_needed(self) -> tuple[str, ...]:
+        """The thermometer."""
+        return (self.thermometer or "temperature",)
+
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """dT/dt of the smoothed thermometer."""
-        return stack(signals["temperature_rate"])
+        return stack(signals[f"{self.columns_needed[0]}_rate"])
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """Every thermometer that varies, `temperature` first."""
+        varying = [n for n in thermometers(signals) if np.ptp(np.asarray(signals[n])) > 0]
+        return [cls(thermometer="" if n == "temperature" else n) for n in varying]
 
 
 class BiasTemperatureProduct(OverTemperature):
