@@ -239,7 +239,7 @@ def test_delay_and_lag_are_one_to_first_order_and_two_beyond():
 @pytest.mark.long
 @pytest.mark.parametrize("effect", ["time_delay", "bandwidth"])
 def test_what_is_late_by_many_samples_is_found_beside_a_gain_of_the_wrong_sign(effect: str):
-    """Ten samples of delay, or twenty of lag: in coloured noise the fit without it has the output turn the other way."""
+    """Ten samples of delay, or twenty of lag: in coloured noise the fit without it has the output turn backwards."""
     late, noise = {"time_delay": (0.1, "flicker_and_walk"), "bandwidth": (0.2, "white")}[effect]
     built = study.build(study.Case(1, "dynamic_rates", noise, effect, 150.0))
     assert built.truth.amplitude == pytest.approx(late, rel=0.5)

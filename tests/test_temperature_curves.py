@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -94,3 +96,26 @@ def test_the_same_ripple_in_bias_and_scale_factor_is_the_thermistor(rng: np.rand
     model = gm.model_from_effects(["scale_factor", "bias", "bias_temperature", "scale_temperature"])
     found = gm.diagnose(campaign, model, hold_out=False)
     assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["thermometer_error"])
+
+
+def test_the_rate_of_a_place_that_lags_by_one_time_constant_is_the_difference_of_both(rng: np.random.Generator):
+    """A Shupe effect of the coil, 400 s behind the case: dT/dt of the coil is the difference over 400 s."""
+    case, coil = cycle(300), np.full(300, 20.0)
+    for i in range(1, 300):
+        kept = np.exp(-60.0 / 400.0)
+        slope = (case[i] - case[i - 1]) / 60.0
+        # Exact where the case goes straight from sample to sample.
+        coil[i] = case[i] - 400.0 * slope + kept * (coil[i - 1] - case[i - 1] + 400.0 * slope)
+    output = 0.02 * (case - 20) + 20.0 * (case - coil) / 400.0 + 0.02 * rng.standard_normal(300)
+    data = {"time": 60.0 * np.arange(300), "temperature": case, "temperature_coil": coil, "output": output}
+    units = {"time": "s", "temperature": "degC", "temperature_coil": "degC", "output": "deg/h"}
+    campaign = Campaign(data, units, {"kind": "rate"})
+    found = gm.diagnose(campaign, gm.model_from_effects(["bias", "bias_temperature"]), hold_out=False)
+    assert found.verdict == "ambiguous"
+    assert {"bias_temperature_rate", "bias_temperature_gradient"} <= set(found.credible_set)
+    rate = gm.model_from_effects(["bias", "bias_temperature", "bias_temperature_rate"])
+    place = {"thermometer": "temperature_coil"}
+    rate = replace(rate, effects=(*rate.effects[:2], replace(rate.effects[2], **place)))
+    estimate = gm.fit(campaign, rate)
+    row = next(r for r in estimate.table() if r.effect == "bias_temperature_rate")
+    assert row.value == pytest.approx(20.0, abs=FAR * row.std + 0.1)

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import lfilter
 
 from gyromodel._checks import accelerations, along_axes, thermometers
 from gyromodel.attitude import COLUMNS
@@ -137,7 +138,20 @@ def _staircase(values: np.ndarray, rows: int) -> np.ndarray:
 
 
 def _followed(time: np.ndarray, first: np.ndarray, second: np.ndarray, history: np.ndarray) -> np.ndarray:
-    """A second thermometer under another history: the first, delayed and offset as it fits the campaign best."""
-    delayed = [np.interp(time - part * np.ptp(time), time, first) for part in DELAYS]
-    best = int(np.argmin([np.var(second - x) for x in delayed]))
-    return np.interp(time - DELAYS[best] * np.ptp(time), time, history) + np.mean(second - delayed[best])
+    """A second thermometer under another history: the first, late and offset as it fits the campaign best."""
+    ways = [(late, part * np.ptp(time)) for late in (_delayed, _lagging) for part in DELAYS]
+    late, by = min(ways, key=lambda way: np.var(second - way[0](time, first, way[1])))
+    return late(time, history, by) + np.mean(second - late(time, first, by))
+
+
+def _delayed(time: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
+    """What was some time before."""
+    return np.interp(time - delay, time, values)
+
+
+def _lagging(time: np.ndarray, values: np.ndarray, constant: float) -> np.ndarray:
+    """What follows with a time constant, at rest before."""
+    even, step = np.linspace(time[0], time[-1], len(time), retstep=True)
+    kept = np.exp(-step / constant) if constant else 0.0
+    x = np.interp(even, time, values)
+    return np.interp(time, even, lfilter([1.0 - kept], [1.0, -kept], x, zi=[kept * x[0]])[0])

@@ -269,5 +269,5 @@ def skipped(model: GyroModel, columns: Iterable[str]) -> set[str]:
         have.add("bias_temperature_gradient")
     elif "bias_temperature" in have:
         have |= seconds
-    grows = {e.label for e in model.effects if e.label in e.supersedes}
+    grows = {e.label for e in model.effects if e.may_grow}
     return have - held - grows - {"bias_step", "bias_periodic"}

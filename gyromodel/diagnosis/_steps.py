@@ -46,7 +46,7 @@ class Found:
     @property
     def grows(self) -> bool:
         """Whether there may be more to it than this form; each further line is a cause of its own."""
-        return self.effect is not None and self.name in self.effect.supersedes and not self.effect.scan
+        return self.effect is not None and self.effect.may_grow and not self.effect.scan
 
     @property
     def points(self) -> tuple[int, ...]:
@@ -113,7 +113,8 @@ class Steps:
         least = (1.0 - BETWEEN) * ranking.explained(name)
         near = {k for k in ranking.statistic if self._has_shape(k) and ranking.explained(k) >= least}
         # What continues an effect is ranked by its slope alone, which may lose most of it.
-        near |= {k for k in ranking.tangents if ranking.statistic.get(k, -np.inf) > 0.5 * score}
+        if self.scanner.record.domain == "gyro":
+            near |= {k for k in ranking.tangents if ranking.statistic.get(k, -np.inf) > 0.5 * score}
         if not near - {name} and (name not in near or driver < score):
             return ranking
         each = [self.step(found, estimate, ranking, k) for k in {name, *near}]

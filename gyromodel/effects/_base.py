@@ -100,6 +100,11 @@ class Effect(eqx.Module):
         return self.id
 
     @property
+    def may_grow(self) -> bool:
+        """Whether a model that has it may have more of it."""
+        return self.label in self.supersedes
+
+    @property
     def grown(self) -> bool:
         """Whether this is a form that is tried only where the model has the effect in another one."""
         return False

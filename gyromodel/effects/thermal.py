@@ -70,10 +70,11 @@ class BiasTemperatureCurve(OverTemperature):
 
 
 class BiasTemperatureRate(Effect):
-    """E += D_Ṫ dT/dt: the Shupe effect; with a lag, of a coil that follows the thermometer through one.
+    """E += D_Ṫ dT/dt: the Shupe effect; T of the place that `thermometer` names, else `temperature`.
 
-    Of several lags, each delays a part of it: E += D_Ṫ L_0 + Σ D_k (L_k − L_0), L_k the rate dT/dt behind the lag k, so
-    that D_Ṫ is always the bias on a steady ramp. A lag below zero says that the thermometer is later than the coil.
+    With a lag, of a coil that follows the thermometer through one. Of several lags, each delays a part of it:
+    E += D_Ṫ L_0 + Σ D_k (L_k − L_0), L_k the rate dT/dt behind the lag k, so that D_Ṫ is always the bias on a steady
+    ramp. A lag below zero says that the thermometer is later than the coil.
     """
 
     id = "bias_temperature_rate"
@@ -86,20 +87,34 @@ class BiasTemperatureRate(Effect):
     coefficient: Float[Array, ""] = parameter("deg/h/(degC/s)", 1000.0, "bias per unit of temperature rate")
     part: Float[Array, " part"] = parameter("deg/h/(degC/s)", 1000.0, "what of it has each further lag", default=())
     lag: Float[Array, " lag"] = parameter("s", 60.0, "how late the coil is", linear=False, default=())
+    thermometer: str = eqx.field(static=True, default="", kw_only=True)
 
     def __check_init__(self) -> None:
         if np.size(self.part) != max(np.size(self.lag) - 1, 0):
             raise ValueError("part takes a value for each lag after the first")
+        if not thermometers((self.thermometer or "temperature",)):
+            raise ValueError("thermometer takes the name of one, temperature or temperature_<place>")
+
+    @property
+    def columns_needed(self) -> tuple[str, ...]:
+        """The thermometer."""
+        return (self.thermometer or "temperature",)
 
     @property
     def remembers(self) -> bool:
         """Where it lags."""
         return np.size(self.lag) > 0
 
+    @property
+    def may_grow(self) -> bool:
+        """By further lags, but not where the place was chosen."""
+        return not self.thermometer
+
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """dT/dt of the smoothed thermometer behind the first lag, then what each other lag changes in that."""
-        rate = signals["temperature_rate"]
-        late = [rate_behind(signals["time"], signals["temperature"], rate, lag) for lag in self.lag] or [rate]
+        name = self.thermometer or "temperature"
+        rate = signals[f"{name}_rate"]
+        late = [rate_behind(signals["time"], signals[name], rate, lag) for lag in self.lag] or [rate]
         return stack(late[0], *(other - late[0] for other in late[1:]))
 
     def unknown(self, signals: Signals) -> Bool[Array, " sample"]:
@@ -116,16 +131,20 @@ class BiasTemperatureRate(Effect):
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
-        """Itself, and with lags from the sample interval to a part of the run where the rate is followed so closely.
+        """Every thermometer that varies, `temperature` first; with one alone, lags of what it is not fixed to."""
+        varying = [n for n in thermometers(signals) if np.ptp(np.asarray(signals[n])) > 0]
+        if len(varying) > 1:
+            return [cls(thermometer=n) for n in varying]
+        return [cls(lag=lag) for lag in _lags(signals)]
 
-        Beside a second thermometer a lag is a difference of temperatures, which has effects of its own.
-        """
-        shortest = interval(signals)
-        longest = LONGEST * float(np.ptp(np.asarray(signals["time_on"])))
-        if longest < shortest or not resolved(signals, "temperature_rate") or len(thermometers(signals)) > 1:
-            return [cls()]
-        lags = np.geomspace(shortest, longest, 1 + int(np.log(longest / shortest) / np.log(NEXT)))
-        return [cls(lag=lag) for lag in [(), *lags[:, None]]]
+
+def _lags(signals: Signals) -> list[Array]:
+    """None, then each from the sample interval to a part of the run, where the rate is followed so closely."""
+    shortest, longest = interval(signals), LONGEST * float(np.ptp(np.asarray(signals["time_on"])))
+    if longest < shortest or not resolved(signals, "temperature_rate"):
+        return [jnp.zeros(0)]
+    number = 1 + int(np.log(longest / shortest) / np.log(NEXT))
+    return [jnp.zeros(0), *jnp.geomspace(shortest, longest, number)[:, None]]
 
 
 class BiasTemperatureProduct(OverTemperature, BiasTemperatureRate):
@@ -160,7 +179,7 @@ class BiasTemperatureProduct(OverTemperature, BiasTemperatureRate):
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
         """Zero at the mean temperature, and at any, then with lags as the Shupe effect has them."""
-        anywhere = [dataclasses.replace(form, at_reference=np.zeros(1)) for form in super().candidates(signals)]
+        anywhere = [cls(at_reference=jnp.zeros(1), lag=lag) for lag in _lags(signals)]
         return [form.prepared(signals) for form in [cls(), *anywhere]]
 
 
