@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from gyromodel.diagnosis._lines import Line, lines_of
 from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, is_driver, is_noise
 from gyromodel.diagnosis._steps import EXCHANGE, Found, Steps, standing
 from gyromodel.estimate import Estimate
+from gyromodel.model import record_span
 
 # Lines that lead every other name by this much (nats) are not chosen again.
 LINE_LEAD = 20.0
@@ -80,9 +82,12 @@ def unresolved(estimate: Estimate, step: Found, reading: float) -> str:
     """Why an effect says nothing, as it is nowhere larger than what passes for it; `reading`: the step of readings.
 
     Readings of what moves within a step stand still, and a still reading of a moving thing is an error that follows
-    the motion: it is not the noise that the evidence weighs. Nor is what another effect may leave.
+    the motion: it is not the noise that the evidence weighs. Nor is what another effect may leave. Lines that a fit
+    moves together are one that is not steady.
     """
     model, record = estimate.model, estimate.record
+    if step.effect is not None and step.effect.scan == "line" and _meet(lines_of(model), 0.5 / record_span(record)):
+        return f"{step.name} would have lines that the record cannot resolve: one that is not steady, and is not named."
     if record.domain == "gyro" or step.effect is None or step.effect.label not in model.labels:
         return ""
     effect = model.effects[model.labels.index(step.effect.label)]
@@ -98,3 +103,10 @@ def unresolved(estimate: Estimate, step: Found, reading: float) -> str:
     else:
         return ""
     return f"{step.name} would be within {within} throughout, where {passes} for it: not named."
+
+
+def _meet(lines: list[Line], distance: float) -> bool:
+    """Whether two lines of one campaign are nearer to each other than some distance (Hz)."""
+    ordered = sorted(lines, key=lambda line: (line.campaign, line.frequency))
+    pairs = zip(ordered, ordered[1:], strict=False)
+    return any(a.campaign == b.campaign and b.frequency - a.frequency < distance for a, b in pairs)

@@ -20,6 +20,7 @@ from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import TIME_MARGIN, Selection
 from gyromodel.diagnosis._shapes import remaining
 from gyromodel.diagnosis._steps import Found, Steps
+from gyromodel.diagnosis._variance import quantum
 from gyromodel.effects import Effect
 from gyromodel.effects.drivers import BiasPeriodic, BiasStep
 from gyromodel.estimate import Estimate
@@ -33,6 +34,8 @@ CREDIBLE = 0.95
 NO_EDGE = ("bias_drift", "bias_warmup")
 # Standard uncertainties from which on a parameter has a size.
 VAGUE = 2.0
+# Times the saw tooth of rounding that a line of its making may be, and steps over which the output has to move for it.
+ROUNDED = 2.0
 # Gross errors that are listed by row.
 ROWS_TOLD = 12
 # A driver that names leave with more than this share of the structure makes the discrepancy unknown.
@@ -159,6 +162,8 @@ def judge(
                 members = {k: 0.5 * share for k, share in members.items()} | {"scale_spline": 0.5}
             elif not scanner.by_points:
                 continue
+        if isinstance(step.effect, BiasPeriodic) and _of_rounding(extended):
+            members = {k: 0.5 * share for k, share in members.items()} | {"noise_quantisation": 0.5}
         if name in baseline.model.wholly_fixed():
             findings.append(f"{name} is fixed in the simulation at a value that the data contradict: it was set free.")
         elif step.grows and name in baseline.model.labels:
@@ -212,6 +217,21 @@ def judge(
     firm = tuple(c for c in named if c.effect not in sets[0])
     test = _next_test(list(sets[0]), record, causes[0])
     return Judgement("ambiguous", (*doubtful, *firm), sets[0], None, test, unexplained, tuple(findings))
+
+
+def _of_rounding(estimate: Estimate) -> bool:
+    """Whether rounding alone makes lines as large as the strongest: of an output that moves over its steps."""
+    record, gain = estimate.record, abs(float(estimate.model.gain()))
+    lines = [e for e in estimate.model.effects if isinstance(e, BiasPeriodic)]
+    output = np.asarray(record.signals["output"])[: record.rows][record.present]
+    step = quantum(output)
+    if step is None or not lines or np.ptp(output) < ROUNDED * step:
+        return False
+    # The fundamental of the saw tooth, less by what noise of the unrounded output smears of it.
+    noise = max(estimate.white_variance - step**2 / 12.0, 0.0)
+    tooth = step / np.pi * np.exp(-2.0 * np.pi**2 * noise / step**2)
+    strongest = max(float(np.hypot(e.cosine, e.sine).max()) for e in lines)
+    return bool(gain * strongest < ROUNDED * tooth)
 
 
 def _sized(parameter: ParameterValue) -> bool:
@@ -313,6 +333,11 @@ def _next_test(names: list[str], record: Record, cause: Cause) -> str:
         return (
             f"Repeat the points at {levels} deg/s several times, in both directions and in random order: anomalous "
             "test points do not come back, a curve does."
+        )
+    if {"bias_periodic", "noise_quantisation"} <= set(names):
+        return (
+            "Run the rates at another speed, or read the output in finer steps: what rounding makes of a steady change "
+            "moves or vanishes, a line stays."
         )
     if any(n.startswith("noise_") for n in names) and not all(n.startswith("noise_") for n in names):
         return "Repeat the run: a deterministic change comes back the same, noise does not."
