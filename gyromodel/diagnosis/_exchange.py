@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from gyromodel.diagnosis._lines import Line, lines_of
@@ -108,5 +110,5 @@ def unresolved(estimate: Estimate, step: Found, reading: float) -> str:
 def _meet(lines: list[Line], distance: float) -> bool:
     """Whether two lines of one campaign are nearer to each other than some distance (Hz)."""
     ordered = sorted(lines, key=lambda line: (line.campaign, line.frequency))
-    pairs = zip(ordered, ordered[1:], strict=False)
+    pairs = pairwise(ordered)
     return any(a.campaign == b.campaign and b.frequency - a.frequency < distance for a, b in pairs)
