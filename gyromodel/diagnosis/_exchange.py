@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
+from itertools import pairwise
 
 import numpy as np
 
@@ -110,5 +110,5 @@ def unresolved(estimate: Estimate, step: Found, reading: float) -> str:
 def _meet(lines: list[Line], distance: float) -> bool:
     """Whether two lines of one campaign are nearer to each other than some distance (Hz)."""
     ordered = sorted(lines, key=lambda line: (line.campaign, line.frequency))
-    pairs = itertools.pairwise(ordered)
+    pairs = pairwise(ordered)
     return any(a.campaign == b.campaign and b.frequency - a.frequency < distance for a, b in pairs)
