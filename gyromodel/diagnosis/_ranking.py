@@ -91,12 +91,13 @@ class Ranking:
         return self.results[self.best_cell(name)].best[name]
 
     def structures(self, bank: Bank, name: str, share: float) -> list[int]:
-        """The best form of each structure of a candidate that explains a share of what its best form does."""
-        explained, best = self.results[self.best_cell(name)].explained, self.best_form(name)[1]
-        forms: dict[str, int] = {}
+        """The best form of each structure, no wider than the best, that explains a share of what the best does."""
+        explained, (form, best, _) = self.results[self.best_cell(name)].explained, self.best_form(name)
+        assert isinstance(form, int)
+        widest, forms = bank.blocks[form].width, dict[str, int]()
         for i in np.argsort(explained):
             block = bank.blocks[i]
-            if block.name == name and explained[i] >= share * best:
+            if block.name == name and explained[i] >= share * best and block.width <= widest:
                 forms[block.structure] = int(i)
         return list(forms.values())
 

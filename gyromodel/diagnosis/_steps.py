@@ -146,7 +146,8 @@ class Steps:
     def step(self, found: Sequence[Found], estimate: Estimate, ranking: Ranking, name: str) -> Found:
         """A candidate of a ranking beside what was found, as one more step; of much evidence, in what fits best.
 
-        A hinge between the places searched loses to two hinges around it.
+        A hinge between the places searched loses to two hinges around it. Nothing wider is tried: what fits better by
+        more shapes than the search asked for fails on data not seen.
         """
         scanner, rows = self._seen(estimate), rows_of(found)
         forms: list[int | None] = [None]
