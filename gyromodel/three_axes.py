@@ -15,7 +15,6 @@ from gyromodel.campaign import AXES, Campaign
 from gyromodel.effects.geometry import Misalignment
 from gyromodel.estimate import Estimate, EstimateError, fit
 from gyromodel.model import ModelError
-from gyromodel.report import with_uncertainty
 from gyromodel.units import factor
 
 # A rotation or a deviation from right angles is one beyond this chance.
@@ -115,5 +114,9 @@ def _stands_out(values: np.ndarray, covariance: np.ndarray) -> bool:
 
 def _listed(values: np.ndarray, covariance: np.ndarray, names: Sequence[str]) -> str:
     scale, std = factor("rad", "arcsec"), np.sqrt(np.diag(covariance))
-    each = [f"{with_uncertainty(v * scale, s * scale)} ({n})" for n, v, s in zip(names, values, std, strict=True)]
+    # To the second digit of the least certain.
+    digits = max(0, 1 - int(np.floor(np.log10(max(std.max() * scale, 1e-9)))))
+    each = [
+        f"{v * scale:z.{digits}f} ± {s * scale:.{digits}f} ({n})" for n, v, s in zip(names, values, std, strict=True)
+    ]
     return f"{', '.join(each)} arcsec"

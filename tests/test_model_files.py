@@ -216,7 +216,7 @@ def test_every_effect_is_written_and_read(label: str, tmp_path: Path):
     columns = {k: jnp.linspace(-1.0, 2.0, 16) for k in ("time", "time_on", "rate", "temperature", "supply_voltage")}
     signals = columns | {"output": 3.0 * columns["rate"], "temperature_rate": columns["rate"]}
     signals |= {"temperature_coil": 2.0 * columns["rate"], "temperature_coil_rate": 3.0 * columns["rate"]}
-    signals |= dict.fromkeys(NEEDED_BESIDES, columns["rate"]) | {"thermistor_resistance": jnp.exp(-columns["temperature"])}
+    signals |= dict.fromkeys(NEEDED_BESIDES, columns["rate"]) | {"thermistor_resistance": jnp.linspace(2e4, 1e3, 16)}
     model = GyroModel((make_effect(label).prepared(signals),), {}, frozenset(), "fog")
     write_model(model, tmp_path / "one.yaml")
     again = read_model(tmp_path / "one.yaml")
