@@ -105,6 +105,14 @@ def test_a_doubtful_cause_does_not_hide_a_firm_one(rng: np.random.Generator) -> 
         assert label == "bias" or label in [c.effect for c in found.causes] or any(label in f for f in found.findings)
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_reversed_output_is_told_of(sign: float, rng: np.random.Generator):
+    rate = rng.uniform(-10.0, 10.0, ROWS)
+    measured = campaign(sign * rate + 0.01 * rng.normal(size=ROWS), unit="deg/s", rate=rate)
+    found = gm.diagnose(measured, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
+    assert any("a sign is reversed" in line for line in found.findings) == (sign < 0)
+
+
 def test_few_draws_cannot_calibrate(rng: np.random.Generator) -> None:
     with pytest.raises(ValueError, match="10 draws cannot show a 99 % point"):
         gm.diagnose(campaign(rng.normal(size=ROWS)), gm.model_from_effects(["bias"]), calibrate=10)

@@ -172,6 +172,12 @@ def diagnose(
         selection = session.pruned(selection)
     last = selection.estimate
     findings += [line for line in (tails(last), noise_level(last), dwells_apart(last, unit)) if line]
+    stated, slope = float(model.gain()), float(last.model.gain())
+    if slope * (stated if np.isfinite(stated) else 1.0) < 0:
+        findings.append(
+            f"The output {'falls' if slope < 0 else 'rises'} as the rate rises: an axis or a sign is reversed"
+            f"{'' if np.isfinite(stated) else ', unless it is wired so'}."
+        )
     say("judging", 0.65)
     scale = factor(record.input_unit, unit)
     ordinary = tuple(hold_out and session.ladder(e)[2] for e in (baseline, selection.estimate))
