@@ -69,10 +69,7 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
         lines = ranking.statistic.get("bias_periodic", -np.inf)
         remains = "bias_periodic" if full and lines >= threshold else ""
         name, score = ranking.best(drivers=False, but=("bias_periodic" if full else "", "" if path else avoid))
-        for more in (
-            f.name for f in path if f.effect is not None and f.name in f.effect.supersedes and not f.effect.scan
-        ):
-            # What was found may have more to it: to a further cause that hardly leads, it is no rival to be ruled out.
+        for more in (f.name for f in path if f.grows):
             if ranking.statistic.get(more, -np.inf) > score - DOUBT:
                 name, score = more, ranking.statistic[more]
         if name is None or not _significant(steps, ranking, name, score, first=not path):
