@@ -24,8 +24,9 @@ ROUNDING = 1e-13
 LINEAR_SHARE = 1e-4
 # Distance from the minimum, as a part of the cost, below which the rate of convergence is taken from the last step.
 CLOSE = 0.1
-# By how much more of the squared distance a step may leave than those before it did.
-SAFETY = 10.0
+# Part of the squared distance that a step leaves at least, as far as a search relies on it: those before it may have
+# left less by luck, along a direction that bends little.
+LEAST_LEFT = 1 / 400
 
 
 class Search(NamedTuple):
@@ -109,10 +110,10 @@ def search_minimum(
         whole = -solve_positive(a, g, jnp.zeros(p, bool))
         least = tolerance * cost_now
         distance = -g @ whole
-        # What the next step will leave of the distance is told from what the last two left: one by itself may have been
-        # lucky, or have taken away what is linear.
+        # What the next step will leave of the distance is told from what the last two left: the one before may have
+        # taken away what is linear.
         part = jnp.where(better & (state.distance <= CLOSE * cost_now), distance / state.distance, 1.0)
-        near = jnp.minimum(SAFETY * jnp.sqrt(part * state.part), 1.0) * distance <= least
+        near = jnp.clip(jnp.sqrt(part * state.part), LEAST_LEFT, 1.0) * distance <= least
         # Where damping has made every step short: at the minimum the residual is orthogonal to every column, or the
         # last step cost or gained next to nothing, as where the cost has a kink.
         short = (promise <= least) & ~(first & held.any())
