@@ -20,7 +20,7 @@ REPORTS = ("report.html", "diagnosis.json", "model.yaml")
 def diagnose_to(
     measured: Sequence[Campaign], model: Path, output: Path, *, calibrate: int = 0, seed: int = 0
 ) -> tuple[Diagnosis, str]:
-    """Diagnose one axis and write the results; and the verdict in a sentence."""
+    """Diagnose one axis and write the results; and the verdict in a sentence, findings in a line each."""
     prepare_folder(output, model)
     from gyromodel.diagnosis import diagnose
     from gyromodel.model_files import read_model, write_model
@@ -32,7 +32,7 @@ def diagnose_to(
     write_model(diagnosis.extended, output / "model.yaml")
     write_text(output / "diagnosis.json", json_text(diagnosis.to_dict() | {"model": "model.yaml"}))
     write_report(diagnosis, output)
-    return diagnosis, sentence(diagnosis)
+    return diagnosis, "\n- ".join([sentence(diagnosis), *diagnosis.findings])
 
 
 def diagnose_axes(

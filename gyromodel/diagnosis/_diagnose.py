@@ -17,13 +17,13 @@ from gyromodel.diagnosis._data import Data, read
 from gyromodel.diagnosis._evidence import SAFE_THRESHOLD
 from gyromodel.diagnosis._gain import ladder_error, nested_gain, no_gain, not_measured
 from gyromodel.diagnosis._isolation import settling_test
-from gyromodel.diagnosis._misfit import unexplained_axes
+from gyromodel.diagnosis._misfit import excess_band, unexplained_axes
 from gyromodel.diagnosis._noise_causes import as_cause, quantisation, telegraph
 from gyromodel.diagnosis._points import dwells_apart
 from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, cells_of_weight, ease, is_driver, is_noise, noise_kinds
 from gyromodel.diagnosis._result import Candidate, Cause, Diagnosis, Gain, ParameterValue, Round
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._search import Progress, Selection, search, significant_driver
+from gyromodel.diagnosis._search import Progress, Selection, search, significant_driver, steadied
 from gyromodel.diagnosis._shapes import driver_shape, minimum_detectable, not_testable
 from gyromodel.diagnosis._steps import EXCHANGE, Found, NoisePath, Steps, standing
 from gyromodel.diagnosis._variance import follow, growing_noise, noise_level, tails, with_variance
@@ -69,7 +69,8 @@ class _Session:
                 driver = significant_driver(ranking, self.threshold, self.scanner.runs)
                 if driver and ranking.statistic[driver] < ranking.statistic[step.name] + EXCHANGE:
                     driver = None
-                return Selection(estimates[-1], found, path, ranking, estimates, driver, remains=step.name)
+                cut = Selection(estimates[-1], found, path, ranking, estimates, driver, remains=step.name)
+                return steadied(Steps(self.scanner, estimates[0], self.threshold), cut)
         return selection
 
 
@@ -166,10 +167,10 @@ def diagnose(
         first = selection.path[0].ranking if selection.path else selection.last
         start = _with_noise_estimated(baseline) or baseline
         selection = Selection(start, (), (), first, (start,), None)
-    findings += [selection.unresolved] if selection.unresolved else []
     if hold_out:
         say("judging each step on blocks left out", 0.62)
         selection = session.pruned(selection)
+    findings += [selection.unresolved] if selection.unresolved else []
     last = selection.estimate
     findings += [line for line in (tails(last), noise_level(last), dwells_apart(last, unit)) if line]
     stated, slope = float(model.gain()), float(last.model.gain())
@@ -202,6 +203,8 @@ def diagnose(
             f"The noise from sample to sample is in part that of quantisation, {size:.3g} arcsec (white noise of the "
             "angle); fits take it as white noise of the rate."
         )
+    elif record.domain == "gyro" and not selection.unresolved and (band := excess_band(selection.estimate)):
+        findings.append(band)
     # Where the simulation leaves its noise to be estimated, its kinds are no discrepancy, but for what no fit holds.
     judgement = with_noise(
         judgement, beyond if baseline.noise_given else [c for c in beyond if c is hops], len(bank.names())

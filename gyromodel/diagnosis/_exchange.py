@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
-from gyromodel.diagnosis._lines import Line, lines_of
+from gyromodel.diagnosis._forms import periodic
+from gyromodel.diagnosis._lines import lines_of, near
+from gyromodel.diagnosis._misfit import unsteady_lines
 from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, is_driver, is_noise
 from gyromodel.diagnosis._steps import EXCHANGE, Found, Steps, standing
+from gyromodel.effects.drivers import BiasPeriodic
 from gyromodel.estimate import Estimate
 from gyromodel.model import record_span
 
@@ -73,6 +77,36 @@ def _chosen_again(
     return found, estimate, rankings
 
 
+def steady(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[list[Found], Estimate, str]:
+    """What was found less the lines that change, its fit, and what is to be said of these: none, if there are none.
+
+    Where these are the stronger, no line stands: the others are parts of the same.
+    """
+    given, changing, far = lines_of(steps.baseline.model), list[float](), 1.0 / record_span(estimate.record)
+    while any(f.name == "bias_periodic" for f in found):
+        lines, effect = lines_of(estimate.model), estimate.model.effects[estimate.model.labels.index("bias_periodic")]
+        assert isinstance(effect, BiasPeriodic)
+        own = np.array([not any(near(line, g, far) for g in given) for line in lines])
+        bad = own & np.array(unsteady_lines(estimate))
+        power = np.asarray(effect.cosine**2 + effect.sine**2)
+        if power[bad].sum() > power[own & ~bad].sum():
+            bad = own
+        kept = [line for line, b in zip(lines, bad, strict=True) if not b]
+        last = [f for f in found if f.name == "bias_periodic"][-1]
+        others = [f for f in found if f.name != "bias_periodic"]
+        others += [replace(last, effect=periodic(kept))] if (own & ~bad).any() else []
+        after = steps.fit(others) if bad.any() else None
+        if after is None:
+            break
+        found, estimate = others, after
+        changing += [line.frequency for line, b in zip(lines, bad, strict=True) if b]
+    if not changing:
+        return found, estimate, ""
+    places = " and ".join(f"{frequency:.4g} Hz" for frequency in sorted(changing))
+    said = f"What oscillates near {places} changes its size or its frequency: it is no steady line, and is not named."
+    return found, estimate, said
+
+
 def uncontested(step: Found) -> bool:
     """Whether it is lines that led every other name by far when they were added: nothing else makes a line."""
     rivals = [v for k, v in step.ranking.statistic.items() if k not in (step.name, "outliers") and not is_driver(k)]
@@ -88,7 +122,8 @@ def unresolved(estimate: Estimate, step: Found, reading: float) -> str:
     moves together are one that is not steady.
     """
     model, record = estimate.model, estimate.record
-    if step.effect is not None and step.effect.scan == "line" and _meet(lines_of(model), 0.5 / record_span(record)):
+    pairs = combinations(lines_of(model), 2)
+    if step.name == "bias_periodic" and any(near(one, other, 0.5 / record_span(record)) for one, other in pairs):
         return f"{step.name} would have lines that the record cannot resolve: one that is not steady, and is not named."
     if record.domain == "gyro" or step.effect is None or step.effect.label not in model.labels:
         return ""
@@ -105,10 +140,3 @@ def unresolved(estimate: Estimate, step: Found, reading: float) -> str:
     else:
         return ""
     return f"{step.name} would be within {within} throughout, where {passes} for it: not named."
-
-
-def _meet(lines: list[Line], distance: float) -> bool:
-    """Whether two lines of one campaign are nearer to each other than some distance (Hz)."""
-    ordered = sorted(lines, key=lambda line: (line.campaign, line.frequency))
-    pairs = pairwise(ordered)
-    return any(a.campaign == b.campaign and b.frequency - a.frequency < distance for a, b in pairs)

@@ -64,7 +64,7 @@ def addition(
     if isinstance(effect, BiasReadoutCode):
         effect = _with_harmonics(scanner, estimate, effect, ranking.best_cell(name), pulses)
     if isinstance(effect, BiasPeriodic):
-        effect = _periodic([*lines_of(estimate.model), *_lines(scanner, ranking, estimate.model)])
+        effect = periodic([*lines_of(estimate.model), *_lines(scanner, ranking, estimate.model)])
     for held in estimate.model.effects:
         effect = effect.joined(held) if held.label in effect.supersedes else effect
     apart = tuple({*pulses, *not_known(scanner, effect)})
@@ -133,7 +133,8 @@ def _explained(cosines: np.ndarray, sines: np.ndarray, taken: np.ndarray, left: 
     )
 
 
-def _periodic(lines: Sequence[Line]) -> BiasPeriodic:
+def periodic(lines: Sequence[Line]) -> BiasPeriodic:
+    """Lines of no size."""
     frequencies, campaigns = zip(*sorted(lines, key=lambda line: line.campaign), strict=True)
     none = jnp.zeros(len(lines))
     return BiasPeriodic(
@@ -177,7 +178,7 @@ def form_effect(scanner: Scanner, name: str, form: int) -> Effect | None:
         return step_at(scanner.record, form)
     if name == "bias_periodic":
         assert scanner.lines is not None
-        return _periodic([scanner.lines.line(form)])
+        return periodic([scanner.lines.line(form)])
     return scanner.bank.blocks[form].effect
 
 

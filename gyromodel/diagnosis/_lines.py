@@ -40,6 +40,11 @@ def lines_of(model: GyroModel) -> list[Line]:
     return [Line(float(f), c) for frequencies, campaigns in each for f, c in zip(frequencies, campaigns, strict=True)]
 
 
+def near(one: Line, other: Line, distance: float) -> bool:
+    """Whether two lines are of one campaign and nearer to each other than some distance (Hz)."""
+    return one.campaign == other.campaign and abs(one.frequency - other.frequency) < distance
+
+
 @dataclass
 class LineGrid:
     """Frequencies searched for lines (Hz) and the Fourier grid that serves them.

@@ -1,21 +1,31 @@
-"""Axes of a vibration test whose oscillations a fitted model does not explain, however well it does the rest.
+"""What a fit leaves that is no noise of the fitted kinds, however well it explains the rest.
 
-A whitening filter takes what is left for noise, and a misfit of a hundredth of the noise's own spread, at the frequency
-of each run, is none that it shows: standard uncertainties would be those of a model that holds.
+A whitening filter takes what is left for noise. In a vibration test a misfit of a hundredth of the noise's own spread,
+at the frequency of each run, is none that it shows: standard uncertainties would be those of a model that holds. A line
+that changes is fitted by its mean, and the rest of it is left, like whatever oscillates at no steady frequency.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import chi2
+from numpy.polynomial.legendre import legvander
+from scipy.stats import chi2, f
 
 from gyromodel.campaign import AXES
+from gyromodel.diagnosis._lines import lines_of, near
 from gyromodel.estimate import Estimate, filter_of, whiten_columns
+from gyromodel.model import record_span
 
-# Probability below which an axis is not explained.
+# Probability below which what is left is no noise.
 SELDOM = 1e-4
 # Part of an oscillation's own size, after what the parameters take of it, below which nothing is left to test.
 LEFT = 1e-2
+# Polynomials of time by which a line's size and phase may change, and the part of its energy that such a change has.
+BENDS, UNSTEADY = 4, 0.2
+# Lines nearer to each other than this, over the length of the record, are as well one that changes.
+NEAR = 1.5
+# Ordinates of a band of frequencies, and its power over that of the others, from which on it is told of.
+NARROWEST, EXCESS = 8, 1.25
 
 
 def unexplained_axes(estimate: Estimate) -> list[str]:
@@ -45,3 +55,65 @@ def axis_probabilities(estimate: Estimate) -> dict[str, float]:
         left = left[:, sizes > LEFT]
         found[AXES[a].upper()] = float(chi2.sf(np.sum((left.T @ residual) ** 2), left.shape[1]))
     return found
+
+
+def unsteady_lines(estimate: Estimate) -> list[bool]:
+    """Whether each line of a model has, or may have, another size or frequency at other times of its campaign."""
+    model, record, lines = estimate.model, estimate.record, lines_of(estimate.model)
+    if not lines:
+        return []
+    time = np.asarray(record.signals["time"])[: record.rows]
+    number = np.asarray(record.signals.get("campaign", np.ones_like(time)))[: record.rows]
+    bent = []
+    for line in lines:
+        within = number == line.campaign if line.campaign else number > 0
+        begin, end = time[within].min(), time[within].max()
+        bends = legvander(2 * (time - begin) / (end - begin) - 1, BENDS)[:, 1:] * within[:, None]
+        wave = np.exp(2j * np.pi * line.frequency * time)[:, None] * bends
+        bent += [wave.real, wave.imag]
+    jacobian = np.asarray(model.linearise(record.signals)[1])
+    p = jacobian.shape[1]
+    columns = np.pad(jacobian, ((0, 0), (0, 2 * BENDS * len(lines))))
+    columns[: record.rows, p:] = np.concatenate(bent, axis=1)
+    columns = np.asarray(whiten_columns(filter_of(record, estimate.ratios), columns))[: record.rows][record.present]
+    columns = columns / np.linalg.norm(columns, axis=0)
+    taken = np.linalg.qr(columns[:, :p])[0]
+    residual, values, found = estimate.whitened[record.present], np.asarray(model.vector()), []
+    slots = list(enumerate(model.slots()))
+    for k in range(len(lines)):
+        wave = columns[:, p + 2 * BENDS * k :][:, : 2 * BENDS]
+        left, sizes, _ = np.linalg.svd(wave - taken @ (taken.T @ wave), full_matrices=False)
+        left = left[:, sizes > LEFT]
+        changing = float(np.sum((left.T @ residual) ** 2))
+        own = [i for i, s in slots if s.linear and s.index == k and model.labels[s.effect] == "bias_periodic"]
+        steady = values[own] @ np.linalg.solve(estimate.covariance[np.ix_(own, own)], values[own])
+        seldom = chi2.sf(changing, left.shape[1]) * len(lines) < SELDOM
+        beside = any(near(lines[k], other, NEAR / record_span(record)) for other in lines[:k] + lines[k + 1 :])
+        found.append(beside or bool(seldom and changing > UNSTEADY * (changing + steady)))
+    return found
+
+
+def excess_band(estimate: Estimate) -> str:
+    """A sentence where some band of frequencies has more power than the fitted noise gives it; empty where none has.
+
+    Bands are halves, quarters and so on of all frequencies, overlapping by half; their number is paid for.
+    """
+    residual = estimate.whitened[estimate.record.present]
+    count = (len(residual) - 1) // 2
+    total = np.concatenate([[0.0], np.cumsum(np.abs(np.fft.rfft(residual))[1 : count + 1] ** 2)])
+    bands, width = [(1.0, 1.0, 0, 0)], count // 2
+    while width >= NARROWEST:
+        for begin in range(0, count - width + 1, width // 2):
+            inside = (total[begin + width] - total[begin]) / width
+            ratio = float(inside * (count - width) / (total[-1] - width * inside))
+            bands.append((float(f.sf(ratio, 2 * width, 2 * (count - width))), ratio, begin + 1, begin + width))
+        width //= 2
+    seldom, ratio, *ends = min(bands)
+    if seldom * len(bands) > SELDOM or ratio < EXCESS:
+        return ""
+    low, high = (k / (len(residual) * estimate.record.interval) for k in ends)
+    return (
+        f"Noise of the fitted kinds does not explain what is left from {low:.3g} to {high:.3g} Hz, with {ratio:.2g} "
+        "times the power of the rest: something oscillates there that is no steady line, or it is noise of another "
+        "kind."
+    )

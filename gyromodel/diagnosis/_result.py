@@ -16,12 +16,13 @@ Verdict = Literal["adequate", "named", "ambiguous", "unknown"]
 
 @dataclass(frozen=True)
 class ParameterValue:
-    """A fitted parameter in its declared unit."""
+    """A fitted parameter in its declared unit; `ci95` where noise may have helped it to be told, as it was large."""
 
     name: str
     value: float
     std: float
     unit: str
+    ci95: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from gyromodel.declarations import measured
 from gyromodel.diagnosis._apart import like
 from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._evidence import log_evidence_ratio, log_sum
-from gyromodel.diagnosis._exchange import SLOW_LEAD, exchanged, unresolved
+from gyromodel.diagnosis._exchange import SLOW_LEAD, exchanged, steady, unresolved
 from gyromodel.diagnosis._forms import MAXIMUM_LINES
 from gyromodel.diagnosis._lines import lines_of
 from gyromodel.diagnosis._pairs import best_pair
@@ -84,7 +84,7 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
             break
         jumps = [i for i, f in enumerate(path) if f.name == "bias_step"]
         if name == "bias_step" and len(jumps) >= MAXIMUM_STEPS:
-            return _before(jumps[0], path, estimates)
+            return steadied(steps, _before(jumps[0], path, estimates))
         step, after = steps.add(path, steps.step(path, estimate, ranking, name))
         small = unresolved(after, step, scanner.step) if after is not None else ""
         if after is None or small:
@@ -117,8 +117,28 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
             name, score = ranking.best(drivers=False, but=("bias_periodic",))
             remains = remains or (str(name) if score >= threshold else "")
     driver = significant_driver(ranking, threshold, scanner.runs)
-    return Selection(
+    selection = Selection(
         estimates[-1], tuple(found), tuple(path), ranking, tuple(estimates), driver, left_out, remains, small
+    )
+    return steadied(steps, selection)
+
+
+def steadied(steps: Steps, selection: Selection) -> Selection:
+    """A selection less the lines that change, which are told of as what remains."""
+    found, estimate, said = steady(steps, list(selection.found), selection.estimate)
+    if not said:
+        return selection
+    ranking = steps.rank(estimate, found)
+    return replace(
+        selection,
+        estimate=estimate,
+        found=tuple(found),
+        last=ranking,
+        estimates=(*selection.estimates[:-1], estimate),
+        driver=significant_driver(ranking, steps.threshold, steps.scanner.runs),
+        left_out={},
+        remains="bias_periodic",
+        unresolved=said,
     )
 
 

@@ -13,11 +13,13 @@ from gyromodel.campaign import Campaign
 from gyromodel.declarations import EARLIER, RATE_OF, measured
 from gyromodel.diagnosis._apart import like, separation, twins
 from gyromodel.diagnosis._drivers import smooth_columns
+from gyromodel.diagnosis._evidence import log_evidence_ratio
 from gyromodel.diagnosis._exchange import uncontested
-from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, is_driver, is_noise
+from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, ease, is_driver, is_noise
 from gyromodel.diagnosis._result import Cause, Confuser, ParameterValue, Verdict
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import TIME_MARGIN, Selection
+from gyromodel.diagnosis._selected import after_selection, least_told
 from gyromodel.diagnosis._shapes import remaining
 from gyromodel.diagnosis._steps import Found, Steps
 from gyromodel.diagnosis._variance import quantum
@@ -173,7 +175,8 @@ def judge(
         close = _close_rival(step, members)
         findings += [close] if close else []
         turn = sum(f.name == name for f in found[i:])
-        causes.append(_cause(scanner, extended, step, turn, ranking, members, statistic, trials, null_scores))
+        least = steps.threshold - (0.0 if i else ease(name, ranking.walks[ranking.best_cell(name)]))
+        causes.append(_cause(scanner, extended, step, turn, ranking, members, statistic, trials, null_scores, least))
         sets.append(members)
     # Of these only something in common has a size: which of them it is, this campaign cannot tell.
     vague = [c.effect for c in causes if any(p.std for p in c.parameters) and not any(map(_sized, c.parameters))]
@@ -182,7 +185,7 @@ def judge(
         sets = [members | shared if c.effect in vague else members for c, members in zip(causes, sets, strict=True)]
     order = sorted(range(len(causes)), key=lambda i: -causes[i].statistic)
     causes, sets = [causes[i] for i in order], [sets[i] for i in order]
-    if selection.remains:
+    if selection.remains and not selection.unresolved:
         findings.append(
             f"More remains than was named: {selection.remains} is still significant (ln B = "
             f"{selection.last.statistic.get(selection.remains, np.nan):.0f}) and was not added."
@@ -360,6 +363,7 @@ def _cause(
     statistic: float,
     trials: int,
     null_scores: np.ndarray,
+    least: float,
 ) -> Cause:
     name = step.name
     if step.frees_noise:
@@ -391,7 +395,22 @@ def _cause(
         each = len(rows) // estimate.model.labels.count(name)
         rows = rows[len(rows) - turn * each :][:each]
         parameters = tuple(ParameterValue(r.name, r.value, r.std, r.unit) for r in rows)
+        if q == 1 and least <= statistic:
+            own = float(log_evidence_ratio(np.array(explained), result.rss, nu, 1))
+            price = min(max(own - statistic, 0.0), float(np.log(shapes)))
+            part = least_told(statistic, least, price, nu)
+            parameters = tuple(_told(p, step.effect, part) for p in parameters)
     return Cause(name, parameters, statistic, p, adjusted, members.get(name, 0.0), confusers, step.points)
+
+
+def _told(parameter: ParameterValue, effect: Effect | None, part: float) -> ParameterValue:
+    """The one coefficient of an effect with its interval, if at `part` of its size it would not have been told."""
+    if effect is None or parameter.name != effect.leading() or not parameter.std > 0.0:
+        return parameter
+    nothing = 1.0 if effect.site == "gain" else 0.0
+    z = (parameter.value - nothing) / parameter.std
+    low, high = (nothing + parameter.std * end for end in after_selection(z, part * abs(z)))
+    return replace(parameter, ci95=(low, high))
 
 
 def _point_parameters(record: Record, estimate: Estimate, rows: tuple[int, ...]) -> tuple[ParameterValue, ...]:

@@ -17,7 +17,7 @@ from gyromodel.report._sentence import confused, kinds, sentence
 from gyromodel.report._words import driver_name, listed, phrase, spoken, title
 
 if TYPE_CHECKING:
-    from gyromodel.diagnosis._result import Cause, Diagnosis, Round
+    from gyromodel.diagnosis._result import Cause, Diagnosis, ParameterValue, Round
 
 _BADGES = {
     "adequate": "Nothing missing",
@@ -26,6 +26,8 @@ _BADGES = {
     "unknown": "Cause unknown",
 }
 _RANKED = 12
+# Standard deviations from a size to an end of its interval from which on the interval is told beside the size.
+_HELPED = 2.1
 
 
 def write_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> list[Path]:
@@ -163,7 +165,8 @@ def _cause(cause: Cause) -> dict[str, Any]:
         "p": _small(cause.p_adjusted),
         "posterior": percent(cause.posterior),
         "parameters": [
-            {"name": spoken(p.name), "value": with_uncertainty(p.value, p.std, p.unit)} for p in cause.parameters
+            {"name": spoken(p.name), "value": with_uncertainty(p.value, p.std, p.unit), "interval": _helped(p)}
+            for p in cause.parameters
         ],
         "confusers": [
             {"title": title(c.effect), "id": c.effect, "separation": c.separation, "word": _separation(c.separation)}
@@ -171,6 +174,16 @@ def _cause(cause: Cause) -> dict[str, Any]:
         ],
         "points": _rows(cause.points),
     }
+
+
+def _helped(parameter: ParameterValue) -> str:
+    """The interval of a size that noise may have helped to be told; empty where that changes it by little."""
+    if parameter.ci95 is None:
+        return ""
+    low, high = parameter.ci95
+    if max(high - parameter.value, parameter.value - low) < _HELPED * parameter.std:
+        return ""
+    return f"{number(low)} to {number(high)} {unit_text(parameter.unit)}"
 
 
 def _rankings(diagnosis: Diagnosis) -> list[dict[str, Any]]:

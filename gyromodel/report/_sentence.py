@@ -78,6 +78,8 @@ def _unknown(diagnosis: Diagnosis) -> str:
     if diagnosis.driver is not None:
         column = diagnosis.driver.column
         follows = f"follows {driver_name(column)}"
+    elif "bias_periodic" in diagnosis.credible_set:
+        follows = "oscillates with a size or a frequency that changes,"
     lead = f"Something real is missing from your simulation: its error {follows}"
     if diagnosis.causes:
         lead = f"{_lacks(diagnosis.causes)}; the error that remains {follows}"

@@ -254,8 +254,8 @@ def amplitude_levels(records: list[Record]) -> list[Level]:
             if name not in SIZED or (name == "bias" and r.case.noise in FAMILY[1:]):
                 continue
             if r.case.times_mde == times and r.answer and r.score and r.score.named:
-                value, std = r.answer.sizes[name]
-                hits.append(bool(abs(value - SIZED[name] - r.truth.amplitude) <= 1.96 * std))
+                low, high = r.answer.sizes[name]
+                hits.append(bool(low <= SIZED[name] + r.truth.amplitude <= high))
         levels.append(_level("16", f"95 % interval of the size, after selection, {times:g}×", "–", must, True, hits))
     return levels
 

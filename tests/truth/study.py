@@ -107,7 +107,8 @@ def run_engine(
     for cause in (c for c in found.causes if c.parameters):
         size = cause.parameters[0]
         scale = factor(size.unit, internal_unit(size.unit))
-        sizes[cause.effect] = (size.value * scale, size.std * scale)
+        low, high = size.ci95 or (size.value - 1.96 * size.std, size.value + 1.96 * size.std)
+        sizes[cause.effect] = (low * scale, high * scale)
     adequate = None
     if after and found.verdict in ("named", "ambiguous"):
         again = gyromodel.diagnose(campaign, found.extended.model_as_given(), hold_out=False)

@@ -55,7 +55,7 @@ class Answer:
     verdict: str
     causes: tuple[str, ...]
     first: str  # top of the first round's ranking, whatever the verdict
-    sizes: dict[str, tuple[float, float]]  # each cause's first parameter and its standard error, in SI
+    sizes: dict[str, tuple[float, float]]  # 95 % interval of each cause's first parameter, in SI
     noise: str  # the likeliest make-up of the noise
     p_value: float | None  # of the campaign as one with nothing hidden, where that was simulated
     adequate_after: bool | None  # whether the extended model, diagnosed again, lacks nothing

@@ -1,0 +1,77 @@
+"""What oscillates and is no steady line, nor noise of a fitted kind: never named, and told of."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import gyromodel as gm
+from gyromodel.diagnosis._misfit import excess_band, unsteady_lines
+from gyromodel.effects.drivers import Bias, BiasPeriodic
+from gyromodel.estimate import fit_record
+from gyromodel.model import GyroModel
+from gyromodel.signals import read_signals
+
+ROWS = 1000
+TIME = np.arange(ROWS, dtype=float)
+
+
+def log(output: np.ndarray) -> gm.Campaign:
+    units = {"time": "s", "output": "deg/h"}
+    return gm.Campaign({"time": TIME, "output": output}, units, {"kind": "rate"})
+
+
+def wanders(t: np.ndarray) -> np.ndarray:
+    return np.sin(2 * np.pi * (0.06 * t + 1.5 * np.sin(2 * np.pi * t / 900)))
+
+
+def decays(t: np.ndarray) -> np.ndarray:
+    return 2.5 * np.exp(-t / 200) * np.sin(2 * np.pi * 0.042 * t)
+
+
+def comes_and_goes(t: np.ndarray) -> np.ndarray:
+    return 2.0 * ((t > 350) & (t < 500)) * np.sin(2 * np.pi * 0.08 * t)
+
+
+@pytest.mark.parametrize("wave", [wanders, decays, comes_and_goes])
+def test_what_changes_is_no_line(wave: Callable[[np.ndarray], np.ndarray], rng: np.random.Generator) -> None:
+    found = gm.diagnose(log(5 + wave(TIME) + 0.5 * rng.normal(size=ROWS)), gm.model_from_effects(["bias"]))
+    assert any("no steady line" in line for line in found.findings)
+    if wave is not wanders:  # which by chance may be much like several steady ones
+        assert found.verdict == "unknown"
+        assert not found.causes
+
+
+def test_steady_lines_are_named_and_no_band_is_told_of(rng: np.random.Generator) -> None:
+    square = np.sign(np.sin(2 * np.pi * 0.0213 * TIME + 1.0))
+    campaign = log(5 + square + 0.5 * rng.normal(size=ROWS))
+    found = gm.diagnose(campaign, gm.model_from_effects(["bias"]), hold_out=False)
+    assert [c.effect for c in found.causes] == ["bias_periodic"]
+    assert not any("oscillates" in line for line in found.findings)
+
+
+@pytest.mark.parametrize("walk", [0.0, 0.1])
+def test_a_steady_line_is_never_said_to_change(walk: float, rng: np.random.Generator) -> None:
+    """Lines in noise of its own each; one in ten thousand may be flagged."""
+    none = np.zeros(1)
+    model = GyroModel((Bias(), BiasPeriodic(cosine=none, sine=none, frequency=np.array([0.0501]))), {})
+    for size in rng.uniform(0.2, 3.0, 20):
+        noise = rng.normal(size=ROWS) + walk * np.cumsum(rng.normal(size=ROWS))
+        line = size * np.sin(2 * np.pi * 0.05 * TIME + rng.uniform(0, 6))
+        assert unsteady_lines(fit_record(read_signals(log(line + noise)), model)) == [False]
+
+
+def test_the_band_of_what_sweeps_is_told_of_and_noise_alone_has_none(rng: np.random.Generator) -> None:
+    """A chirp from 0.1 to 0.14 Hz; noise of its own in each of 20 logs, beside it or alone."""
+    chirp = 0.8 * np.sin(2 * np.pi * (0.1 * TIME + 0.02 * TIME**2 / TIME[-1]))
+    for _ in range(20):
+        noise = 0.7 * rng.standard_t(3, size=ROWS) / np.sqrt(3)
+        fit = fit_record(read_signals(log(noise)), GyroModel((Bias(),), {}))
+        assert excess_band(fit) == ""
+        said = excess_band(fit_record(read_signals(log(noise + chirp)), GyroModel((Bias(),), {})))
+        low, high = map(float, re.findall(r"from ([\d.]+) to ([\d.]+) Hz", said)[0])
+        assert 0.05 < low < 0.14
+        assert 0.1 < high < 0.2
