@@ -95,7 +95,7 @@ def judged(record: study.Record) -> Score:
         causes, credible = (
             tuple(name for name in names if name != "bias_periodic") for names in (answer.causes, answer.credible)
         )
-        only = answer.verdict in ("named", "ambiguous") and not causes
+        only = not causes and not answer.driver and not credible
         answer = replace(answer, causes=causes, credible=credible, verdict="adequate" if only else answer.verdict)
     return judge(record.truth, record.case.design, answer, record.isolable or record.case.effect is None)
 
