@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import signal
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
@@ -31,6 +32,8 @@ if version("jaxlib") == "0.10.2":  # as commands have it: gyromodel/_compiling.p
         "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 "
         "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000000",
     )
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # as in the background of a shell; what tests start inherits it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 os.environ.setdefault("GYROMODEL_TEST_SEED", str(secrets.randbelow(2**32)))
 
 settings.register_profile(
