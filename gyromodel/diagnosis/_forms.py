@@ -31,6 +31,8 @@ LINE_MARGIN = 8.0
 # Harmonics of twice a ramp, the evidence (nats) of a higher one by itself with the search paid for, and by how many
 # steps of the record's resolution it may not be off: of 33 shares of that, the middle ones.
 HARMONICS, HARMONIC_MARGIN, DETUNED, MIDDLE = 256, 4.0, 2.0, range(13, 20)
+# A wave is one where its cosine and sine enclose this part of what those of others do.
+LEAST_DISTINCT = 1e-9
 # A fit with a gain smaller than this part of the simulation's is none.
 LEAST_GAIN = 0.01
 # Part of the samples that may be given up because an effect does not know what was before them.
@@ -99,13 +101,12 @@ def _with_harmonics(
     phasors = np.asarray(waves[:, :HARMONICS] + 1j * waves[:, HARMONICS:])
     turns = 2.0 * np.pi * np.linspace(-DETUNED, DETUNED, 33) / np.ptp(time[scanner.present])
     held, further = list(numbers), [k for k in range(1, 1 + HARMONICS) if k not in numbers]
+    known = [*(k - 1 for k in held), *(HARMONICS + k - 1 for k in held)]
+    taken = np.linalg.qr(np.column_stack([own, pairs[:, known]]))[0]
+    pairs, left = _without(taken, pairs), _without(taken, rest[:, 0])
     while further:
-        known = [*(k - 1 for k in held), *(HARMONICS + k - 1 for k in held)]
-        taken = np.linalg.qr(np.column_stack([own, pairs[:, known]]))[0]
-        left = rest - taken @ (taken.T @ rest)
-        explained = _explained(
-            pairs[:, [k - 1 for k in further]], pairs[:, [HARMONICS + k - 1 for k in further]], taken, left
-        )
+        which = np.array(further) - 1
+        explained = _explained(pairs[:, which], pairs[:, HARMONICS + which], left)
         best = int(explained.argmax())
         freedom = scanner.degrees_of_freedom - taken.shape[1]
         evidence = log_evidence_ratio(explained, float(np.sum(left**2)), freedom, 2)[best]
@@ -113,24 +114,30 @@ def _with_harmonics(
             break
         k = further.pop(best)
         near = phasors[:, [k - 1]] * np.exp(1j * np.outer(time, turns))
-        cosines, sines = (scanner.cells.whiten(g, part) for part in (np.real(near), np.imag(near)))
-        if _explained(cosines, sines, taken, left).argmax() in MIDDLE:
+        cosines, sines = (_without(taken, scanner.cells.whiten(g, part)) for part in (np.real(near), np.imag(near)))
+        if _explained(cosines, sines, left).argmax() in MIDDLE:
             held.append(k)
+            pair = np.linalg.qr(pairs[:, [k - 1, HARMONICS + k - 1]])[0]
+            pairs, left = _without(pair, pairs), _without(pair, left)
+            taken = np.column_stack([taken, pair])
     if len(held) == len(numbers):
         return effect
     common = math.gcd(*held)
     return replace(series, period=series.period / common).with_harmonics(sorted(k // common for k in held))
 
 
-def _explained(cosines: np.ndarray, sines: np.ndarray, taken: np.ndarray, left: np.ndarray) -> np.ndarray:
-    """What each wave explains of what is left once others are taken."""
-    both = [part - taken @ (taken.T @ part) for part in (cosines, sines)]
-    return np.array(
-        [
-            np.sum((np.linalg.qr(np.stack(pair, axis=1))[0].T @ left) ** 2)
-            for pair in zip(*(b.T for b in both), strict=True)
-        ]
-    )
+def _without(taken: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """What orthonormal columns leave of others."""
+    return columns - taken @ (taken.T @ columns)
+
+
+def _explained(cosines: np.ndarray, sines: np.ndarray, left: np.ndarray) -> np.ndarray:
+    """What each wave explains of what is left: nothing where its cosine and sine are all but one column."""
+    cc, ss, cs = np.sum(cosines**2, axis=0), np.sum(sines**2, axis=0), np.sum(cosines * sines, axis=0)
+    c, s = cosines.T @ left, sines.T @ left
+    own = cc * ss - cs**2
+    distinct = own > LEAST_DISTINCT * np.max(cc * ss)
+    return np.where(distinct, (ss * c**2 - 2.0 * cs * c * s + cc * s**2) / np.where(distinct, own, 1.0), 0.0)
 
 
 def periodic(lines: Sequence[Line]) -> BiasPeriodic:
