@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
-from scipy.stats import chi2, f
+from scipy.stats import chi2, f, norm
 
 from gyromodel.campaign import AXES
 from gyromodel.diagnosis._lines import lines_of, near
@@ -26,6 +26,8 @@ BENDS, UNSTEADY = 4, 0.2
 NEAR = 1.5
 # Ordinates of a band of frequencies, and its power over that of the others, from which on it is told of.
 NARROWEST, EXCESS = 8, 1.25
+# Spreads beyond which a sample is a tail: two such side by side would make a band by themselves.
+TAIL = 4.0
 
 
 def unexplained_axes(estimate: Estimate) -> list[str]:
@@ -99,6 +101,8 @@ def excess_band(estimate: Estimate) -> str:
     Bands are halves, quarters and so on of all frequencies, overlapping by half; their number is paid for.
     """
     residual = estimate.whitened[estimate.record.present]
+    most = TAIL * float(np.median(np.abs(residual))) / norm.isf(0.25)
+    residual = np.clip(residual, -most, most)
     count = (len(residual) - 1) // 2
     total = np.concatenate([[0.0], np.cumsum(np.abs(np.fft.rfft(residual))[1 : count + 1] ** 2)])
     bands, width = [(1.0, 1.0, 0, 0)], count // 2

@@ -223,8 +223,6 @@ UNKNOWN: dict[str, tuple[Effect, tuple[str, ...]]] = {  # effect and the columns
     "buried_temperature_ripple": (buried_temperature_ripple, ("temperature[earlier]",)),
 }
 
-SCANS = ("bias_step", "bias_periodic", *UNKNOWN)  # effects that are searched for over many positions
-
 
 def _draw_curve(design: Design, rng: np.random.Generator) -> dict[str, Any]:
     low, high = np.percentile(design.true["temperature"], [25, 75])

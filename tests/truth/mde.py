@@ -1,25 +1,47 @@
 """Minimal detectable sizes from a dense oracle that knows the noise.
 
 Whiten with V = L L^T, project the baseline's columns out, and the norm lambda of what is left of an effect decides
-its power. An effect is at its MDE when lambda = 4.3 (80 % power at 1 %/20 false alarms) or 5.5 for a scan.
+its power. An effect is at its MDE when a test of all its coefficients, at all its shapes, finds it in 80 % of campaigns
+at 1 %/20 false alarms: lambda = 4.3 for one coefficient and no shape, 6.1 for a line of any frequency.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import root_scalar
+from scipy.stats import chi2, ncx2
 
 from .designs import Design
-from .effects import SCANS, error
+from .effects import UNKNOWN, error
 from .motion import BRACKETS, SMALL
 from .noise import Noise
 
 Array = np.ndarray
-REGULAR, SCAN = 4.3, 5.5
+FALSE_ALARMS, POWER = 0.01 / 20, 0.8
+# Coefficients of an effect, and to how many independent trials the search over its shapes comes (`trials`).
+TESTED = dict.fromkeys(UNKNOWN, (1, 100)) | {
+    "scale_nonlinearity": (4, 1),
+    "scale_temperature_curve": (1, 5),
+    "bias_temperature_curve": (1, 5),
+    "bias_thermal_hysteresis": (1, 3),
+    "rate_hysteresis": (1, 3),
+    "bias_warmup": (1, 3),
+    "bias_step": (1, 100),
+    "bias_periodic": (2, 700),
+    "bias_turn_on": (5, 1),
+    "bias_readout_code": (16, 1),
+    "bias_acceleration_squared": (5, 1),
+    "misalignment": (2, 1),
+    "table_tilt": (2, 1),
+    "table_harmonic": (2, 4),
+    "time_delay": (1, 2),
+    "bandwidth": (1, 2),
+}
 
 
 def parts(effect: str | None) -> tuple[str, ...]:
@@ -65,9 +87,12 @@ def oracle(design: Design, noise: Noise, names: tuple[str, ...]) -> Oracle:
     return Oracle(L, basis)
 
 
+@cache
 def target(effect: str) -> float:
     """lambda at the MDE."""
-    return SCAN if effect in SCANS else REGULAR
+    coefficients, shapes = TESTED.get(effect, (1, 1))
+    limit = chi2.isf(FALSE_ALARMS / shapes, coefficients)
+    return root_scalar(lambda x: ncx2.sf(limit, coefficients, x**2) - POWER, bracket=(2.0, 12.0)).root
 
 
 def amplitude(effect: str, design: Design, noise: Noise, shape: dict[str, Any], times_mde: float) -> float:
