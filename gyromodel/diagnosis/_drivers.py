@@ -6,7 +6,9 @@ some time before.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Container, Iterator
+from itertools import combinations
 
 import numpy as np
 
@@ -76,18 +78,27 @@ def smooths(record: Record) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
 
 
 def products(record: Record, known: Container[str]) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Name, values of the first column, and product of each pair of rate or temperature with another, less those known.
+    """Name, values of the first column, and product of each pair of columns, less those known.
 
-    All pairs as smooth functions would be too many. A product is what an effect becomes whose size follows rate or
-    temperature, such as a mass unbalance that changes with temperature.
+    All pairs as smooth functions would be too many. A product is what an effect becomes whose size follows another
+    column, such as a mass unbalance that changes with temperature. Columns of one kind have effects of their own.
     """
-    names = driver_names(record) if record.domain == "gyro" else ()
-    for a in (n for n in ("rate", "temperature") if n in names):
-        alike = {a, "rate", "thermistor_resistance", *thermometers(names)} if a == "temperature" else {a, "rate_spin"}
-        for b in (n for n in names if n not in {*alike, "campaign"} and f"smooth({a}, {n})" not in known):
+    names = [n for n in driver_names(record) if n != "campaign"] if record.domain == "gyro" else []
+    names = sorted(names, key=lambda n: n not in ("rate", "temperature"))
+    for a, b in combinations(names, 2):
+        alike = _kind(record, a) == _kind(record, b) and {a, b} - {"rate", "rate_output"}
+        if alike or (a not in ("rate", "temperature") and (is_angle(record.units[a]) or is_angle(record.units[b]))):
+            continue
+        if f"smooth({a}, {b})" not in known and f"smooth({b}, {a})" not in known:
             x, y = (np.asarray(record.signals[n]) for n in (a, b))
             centred = (v - v[: record.rows].mean() for v in (x, y))
             yield f"smooth({a}, {b})", x, np.prod(list(centred), axis=0)[:, None]
+
+
+def _kind(record: Record, name: str) -> str:
+    """What a column measures, whatever its place or axis."""
+    thermal = name == "thermistor_resistance" or name in thermometers(record.signals)
+    return "temperature" if thermal else re.split("_(?:input|output|spin|[xyz])$", name)[0]
 
 
 def smooth_columns(name: str) -> tuple[str, ...]:

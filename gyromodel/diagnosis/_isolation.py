@@ -108,6 +108,8 @@ def settling_test(
 ) -> str | None:
     """The further test that best parts effects which stand for one another, in words; None if none known helps.
 
+    None, too, where they lie far enough apart as it is.
+
     Args:
         campaigns: what was measured; of a platform none, whose next test is not computed.
         baseline: the simulation.
@@ -130,6 +132,8 @@ def settling_test(
         return nearest(View(record, without, extended.ratios, std), truths)
 
     now = distance()[0]
+    if now >= APART:
+        return None  # what leaves them in doubt is nothing that more data of a known kind would settle
     tried = [(*distance(_output_known(test.campaign, 1)), test.sentence) for test in added_tests(campaigns[-1])]
     reached, *closest, sentence = max(tried, key=lambda t: t[0])
     if not reached > max(WORTHWHILE * now, LEAST):

@@ -201,6 +201,8 @@ def judge(
         elif EARLIER in forms:
             how = "in steps held until nothing changes any more"
         test = f"Vary {' and '.join(bases)} alone, {how}, everything else held, and repeat the run."
+        if bases == ("time",):
+            test = "Repeat the run from power-on, everything held: what comes back is the gyro's, what does not is noise."
         return Judgement("unknown", tuple(causes), {driver: 1.0}, driver, test, unexplained, tuple(findings))
     if not causes and selection.remains:
         return Judgement("unknown", (), {selection.remains: 1.0}, None, None, unexplained, tuple(findings))
