@@ -231,6 +231,13 @@ def test_calibration_is_kept_by_design(rng: np.random.Generator, tmp_path, monke
     drawn = len(said)
     assert np.array_equal(null_scores(scanner, baseline, 128, 1, lambda line, done: said.append(line)), scores)
     assert len(said) == drawn
+    # The same test once more, its noise and what wanders by itself other; and a test half as long.
+    for again, new in ((static_log(rng), False), (static_log(rng).select(slice(ROWS // 2)), True)):
+        record = read_signals(again)
+        other = Scanner(record, build_bank(record), grid._replace(interval=record.interval, span=record_span(record)))
+        alike = fit_record(record, gm.model_from_effects(["bias"]), ratios=white)
+        null_scores(other, alike, 128, 1, lambda line, done: said.append(line))
+        assert (len(said) > drawn) == new
 
 
 def test_a_fold_does_not_search_what_only_the_rows_left_out_would_tell(rng: np.random.Generator) -> None:
@@ -513,3 +520,25 @@ def test_a_rival_ahead_of_all_numbers_has_a_finite_evidence():
     assert [c.effect for c in both] == ["bias", "bias_drift"]
     assert 700 < both[1].statistic - cause.statistic < 800
     assert _as_set(cause, {"bias": 0.25, "bias_drift": 0.75})[1].statistic == pytest.approx(10.0 + np.log(3.0))
+
+
+def test_a_bias_that_follows_the_product_of_two_other_columns_is_no_adequate_model(rng: np.random.Generator) -> None:
+    """Neither of them is rate or temperature, and each alone says nothing."""
+    supply, pressure = (np.sin(2 * np.pi * np.arange(ROWS) / period) for period in (37.0, 61.0))
+    campaign = static_log(rng, 1.5 * supply * pressure).with_column("supply_voltage", 5 + supply, "V")
+    found = gm.diagnose(
+        campaign.with_column("pressure", 1000 + pressure, "Pa"), gm.model_from_effects(["bias"]), hold_out=False
+    )
+    assert found.verdict == "unknown"
+    assert found.driver is not None
+    assert set(found.driver.column.split(" and ")) == {"supply_voltage", "pressure"}
+
+
+def test_a_line_is_told_with_its_aliases() -> None:
+    """A tone of 423.7 Hz, sampled at 64 Hz, is at 423.7 − 7 · 64 = −24.3 Hz; at 64 − 24.3 and 64 + 24.3 Hz as well."""
+    rng, time = np.random.default_rng(7), np.arange(1500) / 64.0
+    output = 5 + 0.5 * np.sin(2 * np.pi * 423.7 * time + 1.0) + rng.standard_normal(1500)
+    campaign = gm.Campaign({"time": time, "output": output}, {"time": "s", "output": "deg/h"}, {"kind": "rate"})
+    found = gm.diagnose(campaign, gm.model_from_effects(["bias"]), hold_out=False)
+    assert [c.effect for c in found.causes] == ["bias_periodic"]
+    assert any("24.3 Hz (39.7, 88.3 Hz, …)" in line for line in found.findings)

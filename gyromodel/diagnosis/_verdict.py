@@ -9,12 +9,14 @@ from math import comb
 import numpy as np
 from scipy import stats
 
+from gyromodel._checks import listed
 from gyromodel.campaign import Campaign
 from gyromodel.declarations import EARLIER, RATE_OF, measured
 from gyromodel.diagnosis._apart import like, separation, twins
 from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._evidence import log_evidence_ratio
 from gyromodel.diagnosis._exchange import uncontested
+from gyromodel.diagnosis._lines import lines_of
 from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, ease, is_driver, is_noise
 from gyromodel.diagnosis._result import Cause, Confuser, ParameterValue, Verdict
 from gyromodel.diagnosis._scan import Scanner
@@ -38,6 +40,8 @@ NO_EDGE = ("bias_drift", "bias_warmup")
 VAGUE = 2.0
 # Times the saw tooth of rounding that a line of its making may be, and steps over which the output has to move for it.
 ROUNDED = 2.0
+# Parts of an interval by which samples may be off a regular grid before they tell a line from its aliases.
+IRREGULAR = 0.01
 # Gross errors that are listed by row.
 ROWS_TOLD = 12
 # A driver that names leave with more than this share of the structure makes the discrepancy unknown.
@@ -138,6 +142,8 @@ def judge(
             "not recorded still shows there."
         )
     findings += [line for step in found if (line := _in_campaign(step.effect))]
+    if any(isinstance(step.effect, BiasPeriodic) for step in found) and (also := _aliases(extended)):
+        findings.append(also)
     held: dict[str, list[str]] = {}
     for label, shape in sorted(extended.model.fixed - baseline.model.fixed):
         held.setdefault(label, []).append(shape)
@@ -202,7 +208,7 @@ def judge(
             how = "in steps held until nothing changes any more"
         test = f"Vary {' and '.join(bases)} alone, {how}, everything else held, and repeat the run."
         if bases == ("time",):
-            test = "Repeat the run from power-on, everything held: what comes back is the gyro's, what does not is noise."
+            test = "Repeat the run from power-on, everything held: noise does not come back."
         return Judgement("unknown", tuple(causes), {driver: 1.0}, driver, test, unexplained, tuple(findings))
     if not causes and selection.remains:
         return Judgement("unknown", (), {selection.remains: 1.0}, None, None, unexplained, tuple(findings))
@@ -222,6 +228,19 @@ def judge(
     firm = tuple(c for c in named if c.effect not in sets[0])
     test = _next_test(list(sets[0]), record, causes[0])
     return Judgement("ambiguous", (*doubtful, *firm), sets[0], None, test, unexplained, tuple(findings))
+
+
+def _aliases(estimate: Estimate) -> str:
+    """Where else lines may lie that regular samples show at these frequencies: the nearest two places of each."""
+    record = estimate.record
+    time = np.asarray(record.signals["time"])[: record.rows]
+    steps = np.diff(time)[np.diff(record.run[: record.rows]) == 0]
+    if np.abs(steps / record.interval - np.round(steps / record.interval)).max() > IRREGULAR:
+        return ""
+    sampled = 1.0 / record.interval
+    lines = sorted({line.frequency for line in lines_of(estimate.model)})
+    each = [f"{f:.4g} Hz ({sampled - f:.4g}, {sampled + f:.4g} Hz, …)" for f in lines]
+    return f"Rows every {record.interval:.4g} s cannot tell a line from its aliases: {listed(each)}."
 
 
 def _of_rounding(estimate: Estimate) -> bool:
