@@ -4,7 +4,8 @@
 
 writes a table with 95 % Clopper-Pearson intervals, a confusion matrix, power curves and p-values to
 benchmarks/results/discovery.md, discovery_confusion.png and discovery_power.png. --scale 0.25 takes a quarter of the
-campaigns.
+campaigns. What was run is kept in benchmarks/results/discovery/, by seed: a study that was stopped goes on where it
+was, and the page is made of all seeds there. --page makes it again without running anything.
 """
 
 from __future__ import annotations
@@ -16,9 +17,8 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
 from importlib.util import find_spec
 from multiprocessing import get_context
 from pathlib import Path
@@ -31,6 +31,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from scipy.stats import binomtest
 
+from benchmarks._kept import Kept, code
 from tests.truth import levels, study
 from tests.truth.campaigns import HOMES, MOTION, TESTABLE, A, B, C, known
 from tests.truth.noise import FAMILY, OUTSIDE
@@ -38,7 +39,10 @@ from tests.truth.verdicts import allowed
 
 RESULTS = Path(__file__).parent / "results"
 # Campaigns at full scale, by what is hidden in them.
-NULLS, EFFECTS, CURVE, UNKNOWNS, PAIRS, INSEPARABLE, CALIBRATED, MUTATED = 400, 600, 200, 300, 400, 120, 200, 60
+NULLS, EFFECTS, CURVE, OUTER, UNKNOWNS, PAIRS = 400, 600, 200, 150, 300, 400
+INSEPARABLE, CALIBRATED, MUTATED = 120, 200, 60
+# In multiples of the minimal detectable size.
+SIZES = (0.5, 1.0, 2.0, 3.0, 10.0)
 # However small the part, so many of what is counted in few campaigns.
 FEWEST = 24
 DRAWS = 200  # of a calibration whose p-values are looked at
@@ -54,10 +58,9 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--output", type=Path, default=RESULTS / "discovery.md")
+    parser.add_argument("--kept", type=Path, default=RESULTS / "discovery", help="folder of what was run")
+    parser.add_argument("--page", action="store_true", help="make the page of what is there")
     return parser.parse_args(argv)
-
-
-Run = Callable[..., list[study.Record]]
 
 
 def _row(v: levels.Level) -> str:
@@ -65,16 +68,17 @@ def _row(v: levels.Level) -> str:
     must = f"{'≥' if v.at_least else '≤'} {100 * v.must:.1f} %"
     measured = f"{100 * v.share:.1f} % ({100 * low:.1f}-{100 * high:.1f})"
     verdict = v.verdict.replace("missed", "**missed**")
-    return f"| {v.row} | {v.measure} | {v.prototype} | {must} | {measured} | {v.total} | {verdict} |"
+    wanted = f"{100 * w.must:.1f} %: {w.verdict}" if (w := v.wanted) else "–"
+    return f"| {v.row} | {v.measure} | {v.prototype} | {must} | {measured} | {v.total} | {verdict} | {wanted} |"
 
 
 def _check(row: str, measure: str, must: str, measured: str, count: int, met: Any) -> str:
-    return f"| {row} | {measure} | – | {must} | {measured} | {count} | {'met' if met else '**missed**'} |"
+    return f"| {row} | {measure} | – | {must} | {measured} | {count} | {'met' if met else '**missed**'} | |"
 
 
 HEAD = [
-    "| row | measure | prototype | must | measured (95 % interval) | n | |",
-    "|---|---|---|---|---|---|---|",
+    "| row | measure | prototype | must | measured (95 % interval) | n | | goal |",
+    "|---|---|---|---|---|---|---|---|",
 ]
 
 
@@ -163,44 +167,32 @@ def _bound(records: list[study.Record]) -> str:
     """Row 5 of an oracle that knows noise and size, and needs as much evidence and as large a share as the engine."""
     named, count = levels.oracle_names(records)
     measure = "what bounds it: named by the oracle as firmly, 1×"
-    return f"| 5 | {measure} | – | – | {100 * named / max(count, 1):.1f} % | {count} | – |"
+    return f"| 5 | {measure} | – | – | {100 * named / max(count, 1):.1f} % | {count} | – | |"
 
 
-def _mutants(
-    run: Run, nulls: list[study.Case], effects: list[study.Case], more: list[study.Case]
-) -> tuple[list[str], list[str], list[study.Record]]:
-    """Rows 1, 5 and 15 with a safeguard off, beside the same campaigns with it on.
-
-    `more` campaigns with nothing hidden are for what one campaign hardly shows. Returns the table, the checks that each
-    row is broken, and the campaigns whose best candidate was added by force.
-    """
-    lines = ["| switched off | measure | with it | without |", "|---|---|---|---|"]
-    checks, forced = [], []
-
-    def line(
-        off: str, row: str, cases: list[study.Case], flag: str, mutant: str, beside: str = ""
-    ) -> list[study.Record]:
-        measure, must, at_least, gain = {
-            "1": ("extension with nothing hidden", 0.02, False, False),
-            "5": ("named, 3×", 0.92, True, False),
-            "15": ("held-out score rises with the best candidate, nothing hidden", 0.5, False, True),
-        }[row]
+def _mutants(parts: dict[str, list[study.Record]]) -> tuple[list[str], list[str]]:
+    """Rows 1, 5 and 15 with a safeguard off, beside the same campaigns with it on: the table, and that each breaks."""
+    lines, checks = ["| switched off | measure | with it | without |", "|---|---|---|---|"], []
+    measures = {
+        "1": ("extension with nothing hidden", 0.02, False, "detected"),
+        "5": ("named, 3×", 0.92, True, "named"),
+        "15": ("held-out score rises with the best candidate, nothing hidden", 0.5, False, "gain_shown"),
+    }
+    for off, row, on, mutant in (
+        ("whitening", "1", "broken", "no_whitening"),
+        ("price of the search", "1", "broken", "no_look_elsewhere"),
+        ("projection", "5", "unbroken", "no_projection"),
+        ("nesting", "15", "forced", "forced_no_nesting"),
+    ):
+        measure, must, at_least, flag = measures[row]
         both = []
-        for name in (beside, mutant):
-            records = run(f"{off}, {name or 'nothing off'}", cases, mutant=name, gain=gain)
-            flags = [getattr(r.score, flag) for r in records]
-            both.append((records, levels.Level(row, measure, "", must, at_least, sum(flags), len(flags))))
-        (first, on), (_, off_) = both
-        lines.append(f"| {off} | {measure} | {100 * on.share:.0f} % | {100 * off_.share:.0f} % |")
-        checks.append(_check(row, f"without {off}: {measure}", "fails the row", f"{100 * off_.share:.1f} %", off_.total,
-                             off_.verdict == "missed"))  # fmt: skip
-        return first
-
-    line("whitening", "1", nulls, "detected", "no_whitening")
-    line("price of the search", "1", nulls, "detected", "no_look_elsewhere")
-    line("projection", "5", effects, "named", "no_projection")
-    forced = line("nesting", "15", more, "gain_shown", "forced_no_nesting", "forced")
-    return lines, checks, forced
+        for label in (on, mutant):
+            flags = [getattr(r.score, flag) for r in parts[label]]
+            both.append(levels.Level(row, measure, "", must, at_least, sum(flags), len(flags)))
+        lines.append(f"| {off} | {measure} | {100 * both[0].share:.0f} % | {100 * both[1].share:.0f} % |")
+        broken, share = both[1].verdict == "missed", f"{100 * both[1].share:.1f} %"
+        checks.append(_check(row, f"without {off}: {measure}", "fails the row", share, both[1].total, broken))
+    return lines, checks
 
 
 def _seconds(case: study.Case) -> tuple[int, float]:
@@ -211,8 +203,8 @@ def _seconds(case: study.Case) -> tuple[int, float]:
     return len(built.truth.noise), time.process_time() - start
 
 
-def _timed(seed: int, designs: Sequence[str] = TIMED) -> str:
-    """Row 18, in one process of its own with nothing drawn before."""
+def _timed(seed: int, designs: Sequence[str] = TIMED) -> list[tuple[str, int, float]]:
+    """Row 18: design, rows and processor seconds, in one process of its own with nothing drawn before."""
     cases = [study.Case(seed + i, name, "flicker", None) for i, name in enumerate(designs)]
     places = ("XDG_CACHE_HOME", "JAX_COMPILATION_CACHE_DIR")
     kept = {name: os.environ[name] for name in places if name in os.environ}
@@ -225,10 +217,15 @@ def _timed(seed: int, designs: Sequence[str] = TIMED) -> str:
             for name in places:
                 os.environ.pop(name)
             os.environ |= kept
-    each = ", ".join(f"{name} ({rows} rows) {spent:.0f}" for name, (rows, spent) in zip(designs, found, strict=True))
-    most = max(spent for _, spent in found)
+    return [(name, *one) for name, one in zip(designs, found, strict=True)]
+
+
+def _spent(seconds: Sequence[tuple[str, int, float]]) -> str:
+    """Row 18 of what was timed."""
+    each = ", ".join(f"{name} ({rows} rows) {spent:.0f}" for name, rows, spent in seconds)
+    most = max(spent for _, _, spent in seconds)
     measure = f"processor seconds with {TIMED_DRAWS} draws and hold-out, the longest: {each}"
-    return _check("18", measure, "≤ 60 s", f"{most:.0f} s", len(found), most <= 60.0)
+    return _check("18", measure, "≤ 60 s", f"{most:.0f} s", len(seconds), most <= 60.0)
 
 
 def _never_hidden() -> list[str]:
@@ -294,7 +291,7 @@ def _said(record: study.Record) -> str:
 
 
 def _missed(records: list[study.Record]) -> list[str]:
-    """Every campaign at 3 x MDE or more, or with nothing hidden, that was not answered right, to draw it again."""
+    """Every campaign of some that was not answered right, to draw it again."""
     wrong = [r for r in records if r.score and r.answer and not r.score.right]
     lines = [
         "## Answers that were not right",
@@ -336,6 +333,48 @@ def _confusion(records: list[study.Record], path: Path) -> None:
     plt.close(figure)
 
 
+def _plan(seed: int, scale: float, controls: Sequence[str]) -> Iterator[tuple[str, list[study.Case], dict[str, Any]]]:
+    """Label, campaigns and options of every part."""
+
+    def many(count: int) -> int:
+        return max(round(count * scale), 6)
+
+    def few(count: int) -> int:
+        return max(many(count), FEWEST)
+
+    beside = {"controls": controls}
+    yield "nothing", study.null_cases(many(NULLS) * 2 // 3, seed, designs=HOMES), beside
+    yield "nothing, moving", study.null_cases(many(NULLS) // 3, seed + 3, designs=MOTION), beside
+    yield "nothing, outside", study.null_cases(many(NULLS), seed + 1, OUTSIDE), {}
+    yield "calibrated", study.null_cases(many(CALIBRATED), seed + 2), {"calibrate": DRAWS}
+    for k, (size, count) in enumerate(zip(SIZES, (CURVE, EFFECTS, CURVE, EFFECTS, EFFECTS), strict=True)):
+        cases = study.effect_cases(many(count) * 2 // 3, seed + 10 + k, size, FAMILY)
+        cases += study.motion_cases(many(count) // 3, seed + 60 + k, size, FAMILY)
+        at_three = beside | {"after": True} if size == 3.0 else {}
+        white = [c for c in cases if c.noise == "white"]
+        yield f"effects {size:g}", [c for c in cases if c not in white], at_three
+        yield f"effects {size:g}, white", white, at_three | {"gain": size == 3.0}
+    anywhere = [n for n in OUTSIDE if not n.startswith("grows")]
+    cases = study.effect_cases(many(OUTER) * 2 // 3, seed + 80, 3.0, anywhere)
+    yield "effects 3, outside", cases + study.motion_cases(many(OUTER) // 3, seed + 81, 3.0, anywhere), {}
+    yield "unknown 3", study.unknown_cases(many(UNKNOWNS), seed + 20, 3.0, FAMILY), beside
+    yield "unknown 10", study.unknown_cases(many(UNKNOWNS), seed + 21, 10.0, FAMILY), {}
+    yield "pairs", study.pair_cases(many(PAIRS), seed + 25, 3.0, FAMILY), {}
+    yield "inseparable", study.inseparable_cases(few(INSEPARABLE), seed + 30), {"after": True}
+    yield "drifts", study.drift_cases(few(INSEPARABLE), seed + 31), {}
+    # With a safeguard off, and the same campaigns with it on.
+    broken = study.null_cases(many(MUTATED), seed + 40, ("flicker_and_walk",), (A, B, C))
+    whole = study.effect_cases(many(MUTATED), seed + 41, 3.0)
+    more = study.null_cases(few(MUTATED), seed + 42)
+    yield "broken", broken, {}
+    yield "no_whitening", broken, {"mutant": "no_whitening"}
+    yield "no_look_elsewhere", broken, {"mutant": "no_look_elsewhere"}
+    yield "unbroken", whole, {}
+    yield "no_projection", whole, {"mutant": "no_projection"}
+    yield "forced", more, {"mutant": "forced", "gain": True}
+    yield "forced_no_nesting", more, {"mutant": "forced_no_nesting", "gain": True}
+
+
 def main(argv: list[str] | None = None) -> None:
     args = _arguments(argv)
     start, controls = time.time(), study.CONTROLS if find_spec("sklearn") else ()
@@ -343,106 +382,72 @@ def main(argv: list[str] | None = None) -> None:
         print(
             "scikit-learn is not installed: no other methods run beside (pip install gyromodel[peers])", file=sys.stderr
         )
-
-    def many(count: int) -> int:
-        return max(round(count * args.scale), 6)
-
-    def few(count: int) -> int:
-        return max(many(count), FEWEST)
-
-    def run(label: str, cases: list[study.Case], **options: Any) -> list[study.Record]:
-        records = study.run_cases(cases, args.workers, **options)
-        print(f"{label}: {len(records)} campaigns, {time.time() - start:.0f} s", file=sys.stderr, flush=True)
-        return records
-
-    seed = args.seed
-    at_rest = study.null_cases(many(NULLS) * 2 // 3, seed, designs=HOMES)
-    nulls = run("nothing hidden", at_rest, controls=controls)
-    moving = study.null_cases(many(NULLS) // 3, seed + 3, designs=MOTION)
-    nulls += run("nothing hidden, moving", moving, controls=controls)
-    outside = run("noise outside the family", study.null_cases(many(NULLS), seed + 1, OUTSIDE))
-    calibrated = run("calibrated", study.null_cases(many(CALIBRATED), seed + 2), calibrate=DRAWS)
-    sized = {}
-    for k, (size, count) in enumerate(((0.5, CURVE), (1.0, EFFECTS), (2.0, CURVE), (3.0, EFFECTS), (10.0, EFFECTS))):
-        cases = study.effect_cases(many(count) * 2 // 3, seed + 10 + k, size, FAMILY)
-        cases += study.motion_cases(many(count) // 3, seed + 60 + k, size, FAMILY)
-        at_three = {"controls": controls, "after": True} if size == 3.0 else {}
-        white = [c for c in cases if c.noise == "white"]
-        sized[size] = run(f"effects at {size:g} x MDE", [c for c in cases if c not in white], **at_three)
-        sized[size] += run("the same in white noise", white, gain=size == 3.0, **at_three)
-    unknown = {}
-    for k, size in enumerate((3.0, 10.0)):
-        cases = study.unknown_cases(many(UNKNOWNS), seed + 20 + k, size, FAMILY)
-        unknown[size] = run(f"unknown at {size:g} x MDE", cases, controls=controls if size == 3.0 else ())
-    pairs = run("two causes", study.pair_cases(many(PAIRS), seed + 25, 3.0, FAMILY))
-    inseparable = run("inseparable", study.inseparable_cases(few(INSEPARABLE), seed + 30), after=True)
-    drifts = run("drifts", study.drift_cases(few(INSEPARABLE), seed + 31))
-    broken = study.null_cases(many(MUTATED), seed + 40, ("flicker_and_walk",), (A, B, C))
-    more = study.null_cases(few(MUTATED), seed + 42)
-    mutants, mutant_checks, forced = _mutants(run, broken, study.effect_cases(many(MUTATED), seed + 41, 3.0), more)
-    seconds = _timed(seed + 70)
-
-    study_ = Study(
-        nulls, outside, calibrated, sized, unknown, pairs, inseparable, drifts, forced,
-        (mutants, mutant_checks), seconds, 2 * 3 * len(broken) + len(more),
-    )  # fmt: skip
-    _write(args, sys.argv[1:] if argv is None else argv, study_)
+    if not args.page:
+        kept = Kept(args.kept / f"seed_{args.seed}.json.gz")
+        made = code(), args.scale
+        if kept.parts and (kept.code, kept.scale) != made:
+            raise SystemExit(
+                f"{kept.path} was made by code {kept.code} at scale {kept.scale:g}, and this is {made[0]} at "
+                f"{made[1]:g}: take another --seed, or remove it"
+            )
+        kept.code, kept.scale = made
+        for label, cases, options in _plan(args.seed, args.scale, controls):
+            if label not in kept.parts:
+                kept.parts[label] = study.run_cases(cases, args.workers, **options)
+                kept.save()
+                print(f"{label}: {len(cases)} campaigns, {time.time() - start:.0f} s", file=sys.stderr, flush=True)
+        if not kept.seconds:
+            kept.seconds = _timed(args.seed + 70)
+            kept.save()
+    found = [Kept(path) for path in sorted(args.kept.glob("seed_*.json.gz"))]
+    whole = [k for k in found if k.seconds]
+    if not whole:
+        raise SystemExit(f"{args.kept} holds no finished study")
+    _write(args, whole)
 
 
-@dataclass(frozen=True)
-class Study:
-    """Records by what was hidden, and the tables that are made as it runs."""
-
-    nulls: list[study.Record]
-    outside: list[study.Record]
-    calibrated: list[study.Record]
-    sized: dict[float, list[study.Record]]  # by multiples of the MDE
-    unknown: dict[float, list[study.Record]]
-    pairs: list[study.Record]
-    inseparable: list[study.Record]
-    drifts: list[study.Record]
-    forced: list[study.Record]
-    mutants: tuple[list[str], list[str]]  # table and checks
-    seconds: str
-    others: int  # campaigns of the safeguards' table
-
-
-def _write(args: argparse.Namespace, argv: Sequence[str], found: Study) -> None:
+def _write(args: argparse.Namespace, whole: list[Kept]) -> None:
     """The page and its figures."""
-    sized, nulls, unknown = found.sized, found.nulls, found.unknown
+    parts = {label: [r for k in whole for r in k.parts[label]] for label in whole[0].parts}
+    nulls, outside = parts["nothing"] + parts["nothing, moving"], parts["nothing, outside"]
+    sized = {size: parts[f"effects {size:g}"] + parts[f"effects {size:g}, white"] for size in SIZES}
+    unknown = {size: parts[f"unknown {size:g}"] for size in (3.0, 10.0)}
     main_sizes = [r for size in (1.0, 3.0, 10.0) for r in sized[size]]
     uncatalogued = [r for records in unknown.values() for r in records]
-    reached = levels.null_levels(nulls + found.outside) + levels.effect_levels(main_sizes)
-    reached += levels.unknown_levels(uncatalogued) + levels.pair_levels(found.pairs)
-    reached += levels.amplitude_levels(main_sizes) + levels.ambiguity_levels(found.inseparable, found.drifts)
-    reached += [levels.settled_level(found.inseparable), levels.noise_level(nulls), levels.adequacy_level(sized[3.0])]
-    reached += [levels.claim_level(found.forced), *levels.gain_coverage(sized[3.0])]
+    reached = levels.null_levels(nulls + outside) + levels.effect_levels(main_sizes)
+    reached += levels.outside_levels(parts["effects 3, outside"])
+    reached += levels.unknown_levels(uncatalogued) + levels.pair_levels(parts["pairs"])
+    reached += levels.amplitude_levels(main_sizes) + levels.ambiguity_levels(parts["inseparable"], parts["drifts"])
+    reached += [levels.settled_level(parts["inseparable"]), levels.noise_level(nulls)]
+    reached += [levels.adequacy_level(sized[3.0]), levels.claim_level(parts["forced"])]
+    reached += levels.gain_coverage(sized[3.0])
     reached.sort(key=lambda v: (float(v.row.rstrip("+")), v.measure))
-    uniform, lowest, count = levels.uniform_p_values(found.calibrated)
+    uniform, lowest, count = levels.uniform_p_values(parts["calibrated"])
     size, error = levels.mean_set_size(sized[3.0])
     at_three = sum(r.isolable for r in sized[3.0])
     controls, control_checks = _controls(nulls, sized[3.0], unknown[3.0], args.seed)
     tenth = binomtest(round(lowest * count), count, 0.1).pvalue > 0.05
     small, three = size - 1.96 * error <= levels.SET_SIZE, f"{size:.2f} ± {error:.2f}"
+    mutants, mutant_checks = _mutants(parts)
     checks = [
         _check("3", "p-values uniform: Kolmogorov-Smirnov", "p > 0.01", f"p = {uniform:.2g}", count, uniform > 0.01),
         _check("3", "p-values in the lowest tenth", "10 %", f"{100 * lowest:.1f} %", count, tenth),
         _check("7", "mean size of the 95 % set, isolable, 3×", f"≤ {levels.SET_SIZE}", three, at_three, small),
-        found.seconds,
+        _spent(whole[-1].seconds),
         *(_leak(sized[s], s) for s in (1.0, 3.0)),
         _bound(sized[1.0]),
         *control_checks,
-        *found.mutants[1],
+        *mutant_checks,
     ]
-    everything = [r for records in sized.values() for r in records] + uncatalogued + nulls + found.outside
-    everything += found.calibrated + found.pairs + found.inseparable + found.drifts + found.forced
     figures = {k: args.output.with_name(f"{args.output.stem}_{k}.png") for k in ("confusion", "power")}
+    commands = [f"    python -m benchmarks.discovery --seed {k.path.stem[5:-5]} --scale {k.scale:g}" for k in whole]
+    made = ", ".join(dict.fromkeys(k.code for k in whole))
     lines = [
         "# Hidden-effect study",
         "",
-        f"{len(everything) + found.others} campaigns, seed {args.seed}, on {args.workers} workers. Made by",
+        f"{sum(map(len, parts.values()))} campaigns, by the package as its tree {made} in git has it. Made by",
         "",
-        f"    python -m benchmarks.discovery {' '.join(argv)}".rstrip(),
+        *commands,
         "",
         "Sizes are multiples of the minimal detectable size, by a dense oracle that knows the noise, but no larger",
         "than the physics allows. A level is met by the measured share, open where it is not and the 95 %",
@@ -471,7 +476,7 @@ def _write(args: argparse.Namespace, argv: Sequence[str], found: Study) -> None:
         "",
         "## Safeguards switched off",
         "",
-        *found.mutants[0],
+        *mutants,
         "",
         "## Power, and p-values with nothing hidden",
         "",
@@ -481,12 +486,15 @@ def _write(args: argparse.Namespace, argv: Sequence[str], found: Study) -> None:
         "",
         f"![confusion matrix]({figures['confusion'].name})",
         "",
-        *_missed(sized[3.0] + sized[10.0] + unknown[3.0] + nulls + found.outside),
-    ]
+        *_missed([
+            r for label, records in parts.items() for r in records
+            if label.startswith(("nothing", "unknown", "pairs", "inseparable", "drifts", "effects 3", "effects 10"))
+        ]),
+    ]  # fmt: skip
     args.output.parent.mkdir(parents=True, exist_ok=True)
     args.output.write_text("\n".join(lines), encoding="utf-8")
     _confusion(sized[3.0] + unknown[3.0], figures["confusion"])
-    p_values = np.array([r.answer.p_value for r in found.calibrated if r.answer])
+    p_values = np.array([r.answer.p_value for r in parts["calibrated"] if r.answer])
     _curves([r for records in sized.values() for r in records], p_values, figures["power"])
 
 

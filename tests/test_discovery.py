@@ -8,15 +8,17 @@ level asserted can fail. The full study is benchmarks/discovery.py.
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from benchmarks._kept import Kept
 from tests.truth import levels, study
 from tests.truth.campaigns import HOMES, MOTION, TESTABLE, UNCATALOGUED, known
 from tests.truth.noise import OUTSIDE
 from tests.truth.study import SLOW
-from tests.truth.verdicts import ACCEPTED
+from tests.truth.verdicts import ACCEPTED, Answer, judge
 
 # Engine calls, each some seconds.
 NULLS, MOVING, STRANGE = 40, 10, 10  # in noise of the family, the same on the move, in other noise anywhere
@@ -88,6 +90,24 @@ def test_uncatalogued_effects_are_unknown_and_their_driver_is_found(seed):
     cases = study.unknown_cases(UNKNOWN_3, seed, 3.0) + study.unknown_cases(UNKNOWN_10, seed + 1, 10.0)
     records = study.run_cases(cases, WORKERS)
     _require(levels.pooled(levels.unknown_levels(records)), records, seed)
+
+
+def test_what_a_study_keeps_on_disk_comes_to_the_same_levels(tmp_path):
+    cases = study.effect_cases(3, 5, 3.0) + study.null_cases(1, 5) + study.unknown_cases(1, 5, 3.0)
+    records = [study.run_case(case, engine=False, controls=("least_squares_f",)) for case in cases]
+    answer = Answer("named", ("bias",), "bias", {"bias": (1.0, 2.0)}, "noise_white", None, True, None, ("bias",), (),
+                    (1.5, 1.2, 1.9), (3.0, 1.0, 5.0))  # fmt: skip
+    records = [replace(r, answer=answer, score=judge(r.truth, r.case.design, answer)) for r in records]
+    kept = Kept(tmp_path / "seed_5.json.gz")
+    kept.code, kept.scale, kept.seconds, kept.parts = "tree", 0.25, [("tumble", 936, 20.5)], {"some": records}
+    kept.save()
+    again = Kept(kept.path)
+    assert (again.code, again.scale, again.seconds) == (kept.code, kept.scale, kept.seconds)
+    for one, other in zip(records, again.parts["some"], strict=True):
+        assert replace(one, truth=one.truth) == replace(other, truth=one.truth)
+        assert (other.truth.amplitude, other.truth.driver) == (one.truth.amplitude, one.truth.driver)
+    both = [levels.effect_levels(r) + levels.gain_coverage(r) for r in (records, again.parts["some"])]
+    assert both[0] == both[1]
 
 
 def test_every_effect_and_uncatalogued_shape_is_in_a_campaign():

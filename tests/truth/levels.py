@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import beta, binom, kstest
@@ -14,6 +14,14 @@ from .study import SLOW, Record
 from .verdicts import Score, allowed
 
 TAIL = 0.0062  # beyond 2.5 standard errors
+# What the method would like to reach, by row and what it must.
+GOALS = {
+    ("1", 0.02): 0.012, ("2", 0.04): 0.02, ("5", 0.55): 0.65, ("5", 0.92): 0.97, ("5", 0.99): 0.998, ("6", 0.01): 0.003,
+    ("6", 0.04): 0.02, ("7", 0.95): 0.97, ("8", 0.85): 0.95, ("8", 0.97): 1.0, ("8", 0.80): 0.92, ("9", 0.02): 0.005,
+    ("10", 0.88): 0.95, ("10", 0.80): 0.92, ("12", 0.90): 0.97, ("12", 0.80): 0.90, ("13", 0.97): 0.99,
+    ("14", 0.75): 0.85, ("15", 0.05): 0.03, ("15", 0.88): 0.92, ("15", 0.99): 0.98, ("16", 0.90): 0.93,
+    ("16", 0.92): 0.94, ("17", 0.95): 0.98,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -49,6 +57,14 @@ class Level:
         if self.share >= self.must if self.at_least else self.share <= self.must:
             return "met"
         return "open" if (high >= self.must if self.at_least else low <= self.must) else "missed"
+
+    @property
+    def wanted(self) -> Level | None:
+        """The same measure against its goal."""
+        goal = GOALS.get((self.row, self.must))
+        if self.row == "4":
+            goal = self.must * next(_GOAL4[size] / must for size, must in _ROW4.items() if f"{size:g}×" in self.measure)
+        return None if goal is None else replace(self, must=goal)
 
     @property
     def plausible(self) -> bool:
@@ -136,7 +152,7 @@ def _alone(records: list[Record]) -> list[Record]:
     return [r for r in records if r.isolable and r.case.effect not in SLOW]
 
 
-_ROW4 = {1.0: 0.93, 3.0: 0.97}
+_ROW4, _GOAL4 = {1.0: 0.93, 3.0: 0.97}, {1.0: 0.97, 3.0: 0.99}
 _ROW5 = {1.0: 0.55, 3.0: 0.92, 10.0: 0.99}
 
 
@@ -177,6 +193,16 @@ def effect_levels(records: list[Record]) -> list[Level]:
             )
         )
     return levels
+
+
+def outside_levels(records: list[Record]) -> list[Level]:
+    """Catalogue effects in noise of other kinds than those fitted, against what rows 5+ and 6 ask in those."""
+    scores = _scores(records)
+    return [
+        _level("5+", "right verdict, 3×, noise outside the family", "–", 0.92, True, [s.right for s in scores]),
+        _level("6", "firm and wrong, catalogue, 3×, noise outside the family", "–", 0.01, False,
+               [s.firm_and_wrong for s in scores]),
+    ]  # fmt: skip
 
 
 def _mean(values: list[bool]) -> float:
@@ -295,7 +321,7 @@ def gain_coverage(records: list[Record]) -> list[Level]:
         white = r.case.noise == "white" and r.case.design not in POSITIONED
         if r.answer and r.score and r.score.named and white:
             _, low, high = r.answer.gain_ratio
-            hits.append(bool(low <= np.sqrt(1 + r.size**2 / len(r.truth.noise)) <= high))
+            hits.append(bool(low <= np.sqrt(1 + r.size**2 / r.rows) <= high))
     measure = "gain interval covers the true gain, white noise"
     return [_level("15", measure, "–", 0.88, True, hits), _level("15", measure, "–", 0.99, False, hits)]
 

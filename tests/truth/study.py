@@ -58,7 +58,7 @@ class Built:
 
 @dataclass(frozen=True)
 class Record:
-    """A case, what the engine answered and how that was judged.
+    """A case of some rows, what the engine answered and how that was judged.
 
     `size` is the norm lambda of the hidden signal; `isolable` whether every rival separates from it at 3 x MDE;
     `oracle_first` what the oracle names, and `oracle_firm` whether it is sure; `controls` what the control methods
@@ -74,6 +74,7 @@ class Record:
     oracle_first: str
     oracle_firm: bool
     controls: dict[str, contest.Control]
+    rows: int
 
 
 def build(case: Case, noise_of: NoiseOf | None = None) -> Built:
@@ -179,7 +180,7 @@ def run_case(
         others = {name: methods[name]() for name in controls}
     answer = run_engine(built, **options) if engine else None
     score = judge(truth, design.name, answer, isolable or not known(case.effect)) if answer else None
-    return Record(case, truth, answer, score, size, isolable, first, firm, others)
+    return Record(case, truth, answer, score, size, isolable, first, firm, others, len(truth.noise))
 
 
 def _isolable(case: Case, truth: Truth, knower: Oracle, signals: contest.Library) -> bool:
