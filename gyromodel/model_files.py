@@ -17,6 +17,8 @@ from gyromodel._yaml import Place, complaint, compose, exact_text
 from gyromodel.effects import Effect
 from gyromodel.effects._base import Domain
 from gyromodel.effects.drivers import BiasColumn
+from gyromodel.effects.scale import ScaleTemperatureCurve
+from gyromodel.effects.thermal import BiasTemperatureCurve
 from gyromodel.estimate import Calibration, Estimate, validity_unit
 from gyromodel.model import GyroModel, ModelError, make_effect, parameter_unit
 from gyromodel.noise import MARKOV_TIME, NOISE_UNITS, check_stated, noise_units
@@ -117,6 +119,10 @@ def _read(path: Path) -> tuple[GyroModel, dict[str, Place]]:
         effects.append(effect)
         if fixed.setdefault(effect.label, known) != known:
             raise item.error(f"of several {effect.label} all have the same parameters fixed, or none")
+    # A curve holds the line as its first power: of both, a fit would know nothing but the sum.
+    curves = [e for e in effects if isinstance(e, BiasTemperatureCurve | ScaleTemperatureCurve)]
+    lines = {name for e in curves if e.coefficients.size and not fixed[e.label] for name in e.supersedes}
+    effects = [e for e in effects if e.label not in lines or fixed[e.label]]
     of: list[Domain] = [effects[0].domain] if effects else ["gyro", "platform"]
     noise, noise_of = _read_noise(top["noise"], of) if "noise" in top else ({}, of[0])
     gyro = top["gyro"].text() if "gyro" in top else ""

@@ -517,3 +517,12 @@ def test_absolute_zero_and_fahrenheit_references(tmp_path: Path):
     assert isinstance(effect, BiasTemperature)
     assert float(effect.reference) == pytest.approx(100.0)
     assert float(effect.coefficient) == pytest.approx(1.8 * DEG_H)
+
+
+def test_a_line_beside_the_curve_that_holds_it_is_left_to_the_curve(tmp_path: Path) -> None:
+    path = tmp_path / "model.yaml"
+    path.write_text("effects: [{effect: bias}, {effect: bias_temperature}, {effect: bias_temperature_curve}]")
+    assert read_model(path).labels == ("bias", "bias_temperature_curve")
+    known = "{effect: bias_temperature, value: 3 deg/h/degC, fixed: true}"
+    path.write_text(f"effects: [{known}, {{effect: bias_temperature_curve}}]")
+    assert read_model(path).labels == ("bias_temperature", "bias_temperature_curve")
