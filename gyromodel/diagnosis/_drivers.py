@@ -27,6 +27,9 @@ SLOW, LAGS = 0.05, (0.01, 0.03, 0.08)
 # ends of a run), and the least part of steps at which rates move.
 RESPONSE, MOVING = (13, 5, 2, 1, -1, -2), 0.5
 RESPONSE_DRIVER = f"smooth({RATE_OF.format('rate')})"
+# A current of which this part follows the output's noise, with so many standard errors, is the output; and how many
+# times their median second differences are that are no jump.
+ALIKE, CERTAIN, NO_JUMP = 0.3, 4.0, 4.0
 # What `compensate` adds is the output itself; every function of the ramp's code is bias_readout_code.
 NOT_DRIVERS = ("time", "output", "segment", "run", "position", "feedback_ramp", "rate_estimated", "rate_estimated_std")
 
@@ -42,7 +45,25 @@ def unusable(record: Record, name: str) -> str:
     missing = int((~np.isfinite(values)).sum())
     if missing:
         return f"{name} is missing in {missing} of {len(values)} rows"
-    return "" if np.ptp(values) > 0 else f"{name} does not vary"
+    if not np.ptp(values) > 0:
+        return f"{name} does not vary"
+    if name == "torquer_current" and _is_output(record, name):
+        return f"{name} has the output's own noise: it is the output, in another unit"
+    return ""
+
+
+def _is_output(record: Record, name: str) -> bool:
+    """Whether a column has the output's noise: its second differences, free of the rate and of jumps, follow those."""
+    names = [name, "output", *(n for n in ("rate",) if n in record.signals)]
+    own, output, *rate = (np.diff(np.asarray(record.signals[n])[: record.rows][record.present], 2) for n in names)
+    for turned in rate:
+        if turned @ turned > 0:
+            own, output = (v - turned * (turned @ v) / (turned @ turned) for v in (own, output))
+    still = np.abs(own) <= NO_JUMP * np.median(np.abs(own))
+    own, output = own[still], output[still]
+    size = np.linalg.norm(own) * np.linalg.norm(output)
+    least = max(ALIKE, CERTAIN / np.sqrt(max(len(own), 1)))
+    return bool(size > 0 and abs(own @ output) > least * size)
 
 
 def driver_names(record: Record) -> tuple[str, ...]:
@@ -83,7 +104,9 @@ def products(record: Record, known: Container[str]) -> Iterator[tuple[str, np.nd
     """
     names = driver_names(record) if record.domain == "gyro" else ()
     for a in (n for n in ("rate", "temperature") if n in names):
-        alike = {a, "rate", "thermistor_resistance", *thermometers(names)} if a == "temperature" else {a, "rate_spin"}
+        alike = {a, "rate_spin", "torquer_current"}
+        if a == "temperature":
+            alike = {a, "rate", "thermistor_resistance", *thermometers(names)}
         for b in (n for n in names if n not in {*alike, "campaign"} and f"smooth({a}, {n})" not in known):
             x, y = (np.asarray(record.signals[n]) for n in (a, b))
             centred = (v - v[: record.rows].mean() for v in (x, y))
