@@ -248,13 +248,41 @@ def test_a_fold_does_not_search_what_only_the_rows_left_out_would_tell(rng: np.r
     assert isinstance(form, int)
     effect = fold.bank.blocks[form].effect
     assert isinstance(effect, BiasWarmup)
-    assert float(record.signals["time_on"][first]) < 9.0 * float(effect.time_constant)
+    assert float(record.signals["time_on"][first]) < 9.0 * effect.time_constant.item()
 
 
 def test_a_warm_up_that_was_over_is_not_searched() -> None:
     time = jnp.arange(100.0) * 10.0
     assert BiasWarmup.candidates({"time_on": time + 1e5}) == []
-    assert min(float(e.time_constant) for e in BiasWarmup.candidates({"time_on": time + 600.0})) >= 50.0 * (1 - 1e-9)
+    assert min(e.time_constant.item() for e in BiasWarmup.candidates({"time_on": time + 600.0})) >= 50.0 * (1 - 1e-9)
+
+
+def warming(rng: np.random.Generator) -> gm.Campaign:
+    """An hour of two decays, each of forty standard deviations, in white noise of 1 deg/h."""
+    time = np.arange(3600.0)
+    output = 5 + rng.standard_normal(len(time))
+    for tau in (60.0, 900.0):
+        decay = np.exp(-time / tau)
+        output += 40 * decay / np.linalg.norm(decay - decay.mean())
+    return gm.Campaign({"time": time, "output": output}, {"time": "s", "output": "deg/h"}, {"kind": "rate"})
+
+
+@pytest.mark.long
+def test_two_decays_of_two_starts_are_one_warm_up(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    found = gm.diagnose([warming(rng), warming(rng)], gm.model_from_effects(["bias"]), hold_out=False)
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["bias_warmup"])
+    told = [p for p in found.causes[0].parameters if p.name.startswith("time_constant")]
+    for tau, size in zip((60.0, 900.0), sorted(told, key=lambda p: p.value), strict=True):
+        assert size.value == pytest.approx(tau, abs=4 * size.std)
+
+
+@pytest.mark.long
+def test_two_decays_of_one_start_are_a_warm_up_or_a_walk(seed: int) -> None:
+    found = gm.diagnose(warming(np.random.default_rng(seed)), gm.model_from_effects(["bias"]), hold_out=False)
+    assert set(found.credible_set) <= {"bias_warmup", "noise_random_walk"}
+    assert found.causes[0].effect == "bias_warmup"
+    assert len(found.causes[0].parameters) == 4
 
 
 def test_ring_laser_table_is_four_points_or_a_curve() -> None:

@@ -167,9 +167,9 @@ BY_HAND = [
     ),
     (
         "bias_warmup",
-        {"amplitude": "3 deg/h", "time_constant": "10 min"},
+        {"amplitude": ["3 deg/h", "-1 deg/h"], "time_constant": ["10 min", "5 min"]},
         {"time_on": [0.0, 600.0]},
-        [3.0, 3.0 * np.exp(-1)],
+        [2.0, 3.0 * np.exp(-1) - np.exp(-2)],
     ),
     (
         "bias_temperature",
