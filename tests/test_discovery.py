@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from tests.truth import levels, study
-from tests.truth.campaigns import HOMES, MOTION, TESTABLE, UNCATALOGUED, known
+from tests.truth.campaigns import HOMES, MOTION, TESTABLE, known
 from tests.truth.noise import OUTSIDE
 from tests.truth.study import SLOW
 from tests.truth.verdicts import ACCEPTED
@@ -88,9 +88,3 @@ def test_uncatalogued_effects_are_unknown_and_their_driver_is_found(seed):
     cases = study.unknown_cases(UNKNOWN_3, seed, 3.0) + study.unknown_cases(UNKNOWN_10, seed + 1, 10.0)
     records = study.run_cases(cases, WORKERS)
     _require(levels.pooled(levels.unknown_levels(records)), records, seed)
-
-
-def test_every_effect_and_uncatalogued_shape_is_in_a_campaign():
-    hidden = {c.effect for c in study.effect_cases(NAMES, 0, 3.0)}
-    assert hidden == {e for d in HOMES for e in TESTABLE[d]}
-    assert {c.effect for c in study.unknown_cases(UNKNOWN_3, 0, 3.0)} == {e for n in UNCATALOGUED.values() for e in n}
