@@ -29,7 +29,7 @@ RESPONSE, MOVING = (13, 5, 2, 1, -1, -2), 0.5
 RESPONSE_DRIVER = f"smooth({RATE_OF.format('rate')})"
 # A current of which this part follows the output's noise, with so many standard errors, is the output; and how many
 # times their median second differences are that are no jump.
-ALIKE, CERTAIN, NO_JUMP = 0.3, 4.0, 4.0
+ALIKE, CERTAIN, NO_JUMP = 0.1, 4.0, 4.0
 # What `compensate` adds is the output itself; every function of the ramp's code is bias_readout_code.
 NOT_DRIVERS = ("time", "output", "segment", "run", "position", "feedback_ramp", "rate_estimated", "rate_estimated_std")
 
