@@ -27,9 +27,9 @@ SLOW, LAGS = 0.05, (0.01, 0.03, 0.08)
 # ends of a run), and the least part of steps at which rates move.
 RESPONSE, MOVING = (13, 5, 2, 1, -1, -2), 0.5
 RESPONSE_DRIVER = f"smooth({RATE_OF.format('rate')})"
-# A current of which this part follows the output's noise, with so many standard errors, is the output; and how many
-# times their median second differences are that are no jump.
-ALIKE, CERTAIN, NO_JUMP = 0.1, 4.0, 4.0
+# A current of which this part follows the output's noise is the output, if it is so many over the root of the samples:
+# four standard errors, as neighbouring second differences of noise are alike. How many times their median are no jump.
+ALIKE, CERTAIN, NO_JUMP = 0.1, 5.6, 4.0
 # What `compensate` adds is the output itself; every function of the ramp's code is bias_readout_code.
 NOT_DRIVERS = ("time", "output", "segment", "run", "position", "feedback_ramp", "rate_estimated", "rate_estimated_std")
 
