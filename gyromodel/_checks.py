@@ -33,6 +33,8 @@ _EXPECTED = tuple(
         (r"supply_voltage", "a voltage", "V mV"),
         (r"pressure", "a pressure", "Pa kPa mbar"),
         (r"table_angle|azimuth|table_(x|y|z|inner|middle|outer)|gimbal_.+", "an angle", "deg rad"),
+        (r"torquer_current", "an electric current or raw counts", "mA A uA count"),
+        (r"backscatter|null_shift", "what a beam monitor gives: a voltage, current, power or number", "count V A W []"),
         (r"feedback_ramp", "raw counts, a voltage or a phase", "count bit V rad []"),
         (r"attitude_[wxyz]|segment|run|position", "a plain number", "[]"),
     )

@@ -8,6 +8,7 @@ those at 30, 50, 70 and 110 deg/s do not.
 from __future__ import annotations
 
 from collections import Counter
+from copy import copy
 from importlib import resources
 from itertools import combinations
 
@@ -23,11 +24,14 @@ from gyromodel.averages import average
 from gyromodel.diagnosis import Cause
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores
+from gyromodel.diagnosis._epochs import epoch_interval
 from gyromodel.diagnosis._evidence import SIZES, explained_for, log_evidence_ratio
+from gyromodel.diagnosis._forms import step_at
 from gyromodel.diagnosis._pairs import best_pair
 from gyromodel.diagnosis._ranking import EASE, ease, rank
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._verdict import _as_set, _places
+from gyromodel.effects.drivers import BiasStep
 from gyromodel.effects.thermal import BiasWarmup
 from gyromodel.estimate import EstimateError, fit_record
 from gyromodel.model import record_span
@@ -255,13 +259,41 @@ def test_a_fold_does_not_search_what_only_the_rows_left_out_would_tell(rng: np.r
     assert isinstance(form, int)
     effect = fold.bank.blocks[form].effect
     assert isinstance(effect, BiasWarmup)
-    assert float(record.signals["time_on"][first]) < 9.0 * float(effect.time_constant)
+    assert float(record.signals["time_on"][first]) < 9.0 * effect.time_constant.item()
 
 
 def test_a_warm_up_that_was_over_is_not_searched() -> None:
     time = jnp.arange(100.0) * 10.0
     assert BiasWarmup.candidates({"time_on": time + 1e5}) == []
-    assert min(float(e.time_constant) for e in BiasWarmup.candidates({"time_on": time + 600.0})) >= 50.0 * (1 - 1e-9)
+    assert min(e.time_constant.item() for e in BiasWarmup.candidates({"time_on": time + 600.0})) >= 50.0 * (1 - 1e-9)
+
+
+def warming(rng: np.random.Generator) -> gm.Campaign:
+    """An hour of two decays, each of forty standard deviations, in white noise of 1 deg/h."""
+    time = np.arange(3600.0)
+    output = 5 + rng.standard_normal(len(time))
+    for tau in (60.0, 900.0):
+        decay = np.exp(-time / tau)
+        output += 40 * decay / np.linalg.norm(decay - decay.mean())
+    return gm.Campaign({"time": time, "output": output}, {"time": "s", "output": "deg/h"}, {"kind": "rate"})
+
+
+@pytest.mark.long
+def test_two_decays_of_two_starts_are_one_warm_up(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    found = gm.diagnose([warming(rng), warming(rng)], gm.model_from_effects(["bias"]), hold_out=False)
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["bias_warmup"])
+    told = [p for p in found.causes[0].parameters if p.name.startswith("time_constant")]
+    for tau, size in zip((60.0, 900.0), sorted(told, key=lambda p: p.value), strict=True):
+        assert size.value == pytest.approx(tau, abs=4 * size.std)
+
+
+@pytest.mark.long
+def test_two_decays_of_one_start_are_a_warm_up_or_a_walk(seed: int) -> None:
+    found = gm.diagnose(warming(np.random.default_rng(seed)), gm.model_from_effects(["bias"]), hold_out=False)
+    assert set(found.credible_set) <= {"bias_warmup", "noise_random_walk"}
+    assert found.causes[0].effect == "bias_warmup"
+    assert len(found.causes[0].parameters) == 4
 
 
 def test_ring_laser_table_is_four_points_or_a_curve() -> None:
@@ -363,6 +395,40 @@ def test_many_residuals_at_once_are_searched_like_each_alone(rng: np.random.Gene
             # Leading lines are corrected by their exact energy where one data set is searched.
             within = 0.3 if name == "bias_periodic" else 1e-6
             assert together[g].evidence[name][7] == pytest.approx(evidence, abs=within)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("size", "walk"), [(1.0, 0.0), (5.0, 0.0), (20.0, 0.0), (5.0, 0.1)])
+def test_the_interval_of_an_epoch_holds_it(size: float, walk: float) -> None:
+    """A step of a size in standard deviations of one sample, at any moment, in noise with a random walk or without."""
+    rng, draws = np.random.default_rng(), 150
+    log = static_log(rng)
+    log = log.select(np.delete(np.arange(ROWS), rng.choice(np.arange(1, ROWS - 1), 20, replace=False)))
+    record = read_signals(log)
+    ratios = NoiseRatios(jnp.array([0.0]), jnp.array([walk**2]))
+    scanner = Scanner(record, build_bank(record), NoiseGrid(ratios, np.zeros(1), record.interval, record_span(record)))
+    time, scale = log.columns["time"] - log.columns["time"][0], np.deg2rad(1 / 3600)
+    drift = walk * np.sqrt(np.diff(time, prepend=0.0) / 20.0)
+    held, stds = 0, []
+    for _ in range(draws):
+        at = rng.uniform(*time[[ROWS // 5, 3 * ROWS // 5]])
+        output = size * (time >= at) + rng.normal(size=len(time)) + np.cumsum(drift * rng.normal(size=len(time)))
+        padded = jnp.asarray(np.pad(scale * output, (0, len(record.signals["time"]) - len(time))))
+        drawn = copy(scanner)
+        drawn.record = record._replace(signals=record.signals | {"output": padded})
+        ones = np.ones((len(padded), 1))
+        row, *_ = drawn.run([0], ones, np.where(scanner.present, padded, 0.0), {})[0].best["bias_step"]
+        assert isinstance(row, int)
+        model = gm.model_from_effects(["bias"]).with_effect(step_at(record, row))
+        estimate = fit_record(drawn.record, model, ratios=ratios.take(0))
+        (step,) = [e for e in estimate.model.effects if isinstance(e, BiasStep)]
+        std, low, high = epoch_interval(drawn, estimate, step, 0)
+        held += low <= at <= high
+        stds.append(std)
+    assert stats.binom.ppf(1e-5, draws, 0.95) <= held <= stats.binom.isf(1e-5, draws, 0.95)
+    # Somewhere between two samples, 20 s apart, at least; a small step is not known to these two.
+    assert min(stds) >= 20.0 / np.sqrt(12.0) - 1e-9
+    assert (np.median(stds) > 10.0) == (size == 1.0)
 
 
 def test_several_lines_are_one_cause(rng: np.random.Generator) -> None:

@@ -15,7 +15,7 @@ import pytest
 
 from benchmarks._kept import Kept
 from tests.truth import levels, study
-from tests.truth.campaigns import HOMES, MOTION, TESTABLE, UNCATALOGUED, known
+from tests.truth.campaigns import HOMES, MOTION, TESTABLE, known
 from tests.truth.noise import OUTSIDE
 from tests.truth.study import SLOW
 from tests.truth.verdicts import ACCEPTED, Answer, judge
@@ -108,9 +108,3 @@ def test_what_a_study_keeps_on_disk_comes_to_the_same_levels(tmp_path):
         assert (other.truth.amplitude, other.truth.driver) == (one.truth.amplitude, one.truth.driver)
     both = [levels.effect_levels(r) + levels.gain_coverage(r) for r in (records, again.parts["some"])]
     assert both[0] == both[1]
-
-
-def test_every_effect_and_uncatalogued_shape_is_in_a_campaign():
-    hidden = {c.effect for c in study.effect_cases(NAMES, 0, 3.0)}
-    assert hidden == {e for d in HOMES for e in TESTABLE[d]}
-    assert {c.effect for c in study.unknown_cases(UNKNOWN_3, 0, 3.0)} == {e for n in UNCATALOGUED.values() for e in n}

@@ -52,6 +52,9 @@ def signals_of(rng: np.random.Generator) -> dict[str, jax.Array]:
         "rate_output": np.sin(time / 100),
         "azimuth": rng.uniform(0, 6, ROWS),
         "table_angle": rng.uniform(0, 60, ROWS),
+        "torquer_current": 1e-2 * rng.uniform(-1, 1, ROWS),
+        "backscatter": rng.uniform(0, 1, ROWS),
+        "null_shift": rng.uniform(-1, 1, ROWS),
         "magnetic_field": 1e-4 * rng.uniform(-1, 1, ROWS),
         "output": rng.standard_normal(ROWS),
     }
@@ -164,9 +167,9 @@ BY_HAND = [
     ),
     (
         "bias_warmup",
-        {"amplitude": "3 deg/h", "time_constant": "10 min"},
+        {"amplitude": ["3 deg/h", "-1 deg/h"], "time_constant": ["10 min", "5 min"]},
         {"time_on": [0.0, 600.0]},
-        [3.0, 3.0 * np.exp(-1)],
+        [2.0, 3.0 * np.exp(-1) - np.exp(-2)],
     ),
     (
         "bias_temperature",
@@ -281,6 +284,19 @@ BY_HAND = [
         {"coefficient": "2 deg/h/mbar", "reference": "1000 mbar"},
         {"pressure": [1e5, 1.003e5]},
         [0.0, 6.0],
+    ),
+    ("bias_backscatter", {"coefficient": "2 deg/h/V", "reference": "1 V"}, {"backscatter": [1.0, 1.5]}, [0.0, 1.0]),
+    ("bias_null_shift", {"coefficient": "2 deg/h/mA", "reference": "1 mA"}, {"null_shift": [1e-3, 4e-3]}, [0.0, 6.0]),
+    (
+        "torquer_scale",
+        {
+            "scale": ["1 deg/h/mA"],
+            "asymmetry": ["2 deg/h/mA"],
+            "temperature": ["0.1 deg/h/mA/degC"],
+            "reference": "20 degC",
+        },
+        {"torquer_current": [0.0, 0.01, -0.01, 0.01], "temperature": [20.0, 20.0, 20.0, 30.0]},
+        [0.0, 10.0 + 10.0, -10.0 + 10.0, 20.0 + 10.0],
     ),
     ("bias_acceleration_input", {"coefficient": "2 deg/h/g"}, {"acceleration_input": [G, -0.5 * G]}, [2.0, -1.0]),
     ("bias_acceleration_spin", {"coefficient": "2 deg/h/g"}, {"acceleration_spin": [G, -0.5 * G]}, [2.0, -1.0]),

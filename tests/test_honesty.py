@@ -170,6 +170,9 @@ def test_a_step_is_in_one_of_several_campaigns(rng: np.random.Generator, tmp_pat
     assert abs(float(step.epoch) - TIME[ROWS // 3]) < 30.0
     size = found.causes[0].parameters[0]
     assert size.value == pytest.approx(3.0, abs=5 * size.std)
+    epoch = next(p for p in found.causes[0].parameters if p.name == "epoch")
+    assert epoch.ci95 is not None
+    assert epoch.ci95[0] < float(step.epoch) < epoch.ci95[1] < epoch.ci95[0] + 40 * epoch.std
     # The model file keeps where it is.
     write_model(found.extended, tmp_path / "model.yaml")
     again = read_model(tmp_path / "model.yaml").effects[-1]

@@ -98,7 +98,7 @@ def test_vector_holds_the_free_parameters_in_the_order_of_the_slots():
     assert np.array_equal(model.with_vector(numbers).vector(), numbers)
     fixed = GyroModel(model.effects, {}, frozenset({("bias_warmup", "time_constant"), ("scale_factor", "value")}))
     assert [s.field for s in fixed.slots()] == ["coefficients", "coefficients", "amplitude", "kappa"]
-    assert float(fixed.with_vector(jnp.arange(4.0)).effects[2].time_constant) == 600.0  # type: ignore[attr-defined]
+    assert fixed.with_vector(jnp.arange(4.0)).effects[2].time_constant.item() == 600.0  # type: ignore[attr-defined]
 
 
 def test_an_added_effect_replaces_what_it_contains():

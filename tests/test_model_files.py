@@ -20,7 +20,7 @@ from gyromodel.campaign import Campaign
 from gyromodel.effects import CATALOGUE
 from gyromodel.effects.drivers import Bias, BiasColumn
 from gyromodel.effects.scale import ScaleFactor, ScaleSpline
-from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureCurve
+from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureCurve, BiasWarmup
 from gyromodel.estimate import Estimate, fit
 from gyromodel.model import GyroModel, ModelError, make_effect, model_from_effects
 from gyromodel.model_files import read_calibration, read_model, write_model
@@ -204,7 +204,7 @@ def test_any_numbers_survive_bit_for_bit(tmp_path: Path, numbers: list[float], p
 
 NEEDED_BESIDES = {
     "acceleration_input", "acceleration_spin", "acceleration_output", "vibration", "rate_spin", "rate_output",
-    "magnetic_field", "azimuth", "table_angle", "feedback_ramp",
+    "magnetic_field", "azimuth", "table_angle", "feedback_ramp", "torquer_current", "backscatter", "null_shift",
 }  # fmt: skip
 
 
@@ -225,6 +225,28 @@ def test_every_effect_is_written_and_read(label: str, tmp_path: Path):
         found[0][0][1]["unit"] = ""  # a number without unit is one of a rate output
     assert found == expected
     assert np.array_equal(again.predict(signals), model.predict(signals))
+
+
+@pytest.mark.parametrize("std", [False, True])
+def test_a_warm_up_of_one_number_each_is_one_of_one_term(std: bool, tmp_path: Path):
+    """As files had it before a warm-up took several terms."""
+    tau = "{value: 10 min, std: 3 s}" if std else "10 min"
+    text = "effects:\n  - {effect: bias_warmup, amplitude: 3 deg/h, time_constant: TAU}\n".replace("TAU", tau)
+    (tmp_path / "old.yaml").write_text(text, encoding="utf-8")
+    (warmup,) = read_model(tmp_path / "old.yaml").effects
+    assert isinstance(warmup, BiasWarmup)
+    assert np.array_equal(warmup.time_constant, [600.0])
+    assert warmup.contribution({"time_on": jnp.zeros(1)}) == pytest.approx(3 * np.pi / 180 / 3600)
+    write_model(GyroModel((warmup.joined(warmup),)), tmp_path / "two.yaml")
+    (two,) = read_model(tmp_path / "two.yaml").effects
+    assert isinstance(two, BiasWarmup)
+    assert np.array_equal(two.time_constant, [600.0, 600.0])
+
+
+@pytest.mark.parametrize("terms", [{"time_constant": [60.0, 900.0]}, {"amplitude": [], "time_constant": []}])
+def test_a_warm_up_needs_an_amplitude_for_each_time_constant(terms: dict):
+    with pytest.raises(ValueError, match="every amplitude has a time constant"):
+        BiasWarmup(**terms)
 
 
 @pytest.fixture(scope="module")

@@ -30,6 +30,9 @@ OWNERS = (
         "rate_output": "misalignment",
         "azimuth": "table_tilt",
         "table_angle": "table_harmonic",
+        "torquer_current": "torquer_scale",
+        "backscatter": "bias_backscatter",
+        "null_shift": "bias_null_shift",
     }
     | {f"magnetic_field_{axis}": "bias_magnetic" for axis in "xyz"}
     | {f"rate_{axis}": "misalignment" for axis in "xyz"}

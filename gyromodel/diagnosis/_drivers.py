@@ -29,6 +29,9 @@ SLOW, LAGS = 0.05, (0.01, 0.03, 0.08)
 # ends of a run), and the least part of steps at which rates move.
 RESPONSE, MOVING = (13, 5, 2, 1, -1, -2), 0.5
 RESPONSE_DRIVER = f"smooth({RATE_OF.format('rate')})"
+# A current of which this part follows the output's noise is the output, if it is so many over the root of the samples:
+# four standard errors, as neighbouring second differences of noise are alike. How many times their median are no jump.
+ALIKE, CERTAIN, NO_JUMP = 0.1, 5.6, 4.0
 # What `compensate` adds is the output itself; every function of the ramp's code is bias_readout_code.
 NOT_DRIVERS = ("time", "output", "segment", "run", "position", "feedback_ramp", "rate_estimated", "rate_estimated_std")
 
@@ -44,7 +47,25 @@ def unusable(record: Record, name: str) -> str:
     missing = int((~np.isfinite(values)).sum())
     if missing:
         return f"{name} is missing in {missing} of {len(values)} rows"
-    return "" if np.ptp(values) > 0 else f"{name} does not vary"
+    if not np.ptp(values) > 0:
+        return f"{name} does not vary"
+    if name == "torquer_current" and _is_output(record, name):
+        return f"{name} has the output's own noise: it is the output, in another unit"
+    return ""
+
+
+def _is_output(record: Record, name: str) -> bool:
+    """Whether a column has the output's noise: its second differences, free of the rate and of jumps, follow those."""
+    names = [name, "output", *(n for n in ("rate",) if n in record.signals)]
+    own, output, *rate = (np.diff(np.asarray(record.signals[n])[: record.rows][record.present], 2) for n in names)
+    for turned in rate:
+        if turned @ turned > 0:
+            own, output = (v - turned * (turned @ v) / (turned @ turned) for v in (own, output))
+    still = np.abs(own) <= NO_JUMP * np.median(np.abs(own))
+    own, output = own[still], output[still]
+    size = np.linalg.norm(own) * np.linalg.norm(output)
+    least = max(ALIKE, CERTAIN / np.sqrt(max(len(own), 1)))
+    return bool(size > 0 and abs(own @ output) > least * size)
 
 
 def driver_names(record: Record) -> tuple[str, ...]:
@@ -96,7 +117,9 @@ def products(record: Record, known: Container[str]) -> Iterator[tuple[str, np.nd
 
 
 def _kind(record: Record, name: str) -> str:
-    """What a column measures, whatever its place or axis."""
+    """What a column measures, whatever its place or axis; a torquer's current follows the rate."""
+    if name == "torquer_current":
+        return "rate"
     thermal = name == "thermistor_resistance" or name in thermometers(record.signals)
     return "temperature" if thermal else re.split("_(?:input|output|spin|[xyz])$", name)[0]
 

@@ -16,7 +16,10 @@ Verdict = Literal["adequate", "named", "ambiguous", "unknown"]
 
 @dataclass(frozen=True)
 class ParameterValue:
-    """A fitted parameter in its declared unit; `ci95` where noise may have helped it to be told, as it was large."""
+    """A fitted parameter in its declared unit; `ci95` where that is not 1.96 `std` to either side.
+
+    As noise may have helped it to be told, being large, or as it is an epoch.
+    """
 
     name: str
     value: float

@@ -241,7 +241,7 @@ class Scanner:
             groups = self.cells.groups(cells, stacked.shape[1])
             return [batch for group in pool.map(search, groups) for batch in group]
 
-    def _to_run_end(self, onwards: np.ndarray) -> np.ndarray:
+    def to_run_end(self, onwards: np.ndarray) -> np.ndarray:
         """Of sums from each sample to the last, those from each epoch to the end of its run."""
         return onwards[self.epochs] - np.concatenate([onwards, np.zeros_like(onwards[:1])])[self._run_ends]
 
@@ -268,8 +268,8 @@ class Scanner:
         cross_j = cross[:, :p] @ root.T
         self._blocks(batch, cell, cross_j, cross[:, p:] - cross_j @ jy, nu, least)
         if self.steps:
-            sj, sy = (self._to_run_end(np.cumsum(v[::-1], axis=0)[::-1]) for v in (zj, zy))
-            self._single(batch, "bias_step", self.epochs, sy, self._to_run_end(cell.step), sj, nu)
+            sj, sy = (self.to_run_end(np.cumsum(v[::-1], axis=0)[::-1]) for v in (zj, zy))
+            self._single(batch, "bias_step", self.epochs, sy, self.to_run_end(cell.step), sj, nu)
         if self.outliers:
             rows = np.flatnonzero(self.present[: self.record.rows])
             if self.by_points:

@@ -14,6 +14,7 @@ from gyromodel.campaign import Campaign
 from gyromodel.declarations import EARLIER, RATE_OF, measured
 from gyromodel.diagnosis._apart import like, separation, twins
 from gyromodel.diagnosis._drivers import smooth_columns
+from gyromodel.diagnosis._epochs import epoch_interval
 from gyromodel.diagnosis._evidence import log_evidence_ratio
 from gyromodel.diagnosis._exchange import uncontested
 from gyromodel.diagnosis._lines import lines_of
@@ -185,7 +186,8 @@ def judge(
         causes.append(_cause(scanner, extended, step, turn, ranking, members, statistic, trials, null_scores, least))
         sets.append(members)
     # Of these only something in common has a size: which of them it is, this campaign cannot tell.
-    vague = [c.effect for c in causes if any(p.std for p in c.parameters) and not any(map(_sized, c.parameters))]
+    sizes = [_fitted(c) for c in causes]
+    vague = [c.effect for c, s in zip(causes, sizes, strict=True) if any(p.std for p in s) and not any(map(_sized, s))]
     if len(vague) > 1:
         shared = dict.fromkeys(vague, 1.0 / len(vague))
         sets = [members | shared if c.effect in vague else members for c, members in zip(causes, sets, strict=True)]
@@ -256,6 +258,12 @@ def _of_rounding(estimate: Estimate) -> bool:
     tooth = step / np.pi * np.exp(-2.0 * np.pi**2 * noise / step**2)
     strongest = max(float(np.hypot(e.cosine, e.sine).max()) for e in lines)
     return bool(gain * strongest < ROUNDED * tooth)
+
+
+def _fitted(cause: Cause) -> list[ParameterValue]:
+    """Parameters that a fit has estimated: an epoch is none, however well it is known."""
+    held = () if cause.points or is_noise(cause.effect) else effect_class(cause.effect).held
+    return [p for p in cause.parameters if p.name not in held]
 
 
 def _sized(parameter: ParameterValue) -> bool:
@@ -421,6 +429,8 @@ def _cause(
             price = min(max(own - statistic, 0.0), float(np.log(shapes)))
             part = least_told(statistic, least, price, nu)
             parameters = tuple(_told(p, step.effect, part) for p in parameters)
+        if isinstance(step.effect, BiasStep):
+            parameters = tuple(_dated(scanner, estimate, turn, g, p) for p in parameters)
     return Cause(name, parameters, statistic, p, adjusted, members.get(name, 0.0), confusers, step.points)
 
 
@@ -432,6 +442,16 @@ def _told(parameter: ParameterValue, effect: Effect | None, part: float) -> Para
     z = (parameter.value - nothing) / parameter.std
     low, high = (nothing + parameter.std * end for end in after_selection(z, part * abs(z)))
     return replace(parameter, ci95=(low, high))
+
+
+def _dated(scanner: Scanner, estimate: Estimate, turn: int, g: int, parameter: ParameterValue) -> ParameterValue:
+    """The epoch of the step that stands `turn` from the last, with its interval; any other parameter as it is."""
+    if parameter.name != "epoch":
+        return parameter
+    own = [e for e in estimate.model.effects if isinstance(e, BiasStep)][-turn]
+    std, low, high = epoch_interval(scanner, estimate, own, g)
+    scale = factor("s", parameter.unit)
+    return replace(parameter, std=std * scale, ci95=(low * scale, high * scale))
 
 
 def _point_parameters(record: Record, estimate: Estimate, rows: tuple[int, ...]) -> tuple[ParameterValue, ...]:

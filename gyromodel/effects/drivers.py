@@ -1,4 +1,4 @@
-"""Bias effects of time and of any other measured column."""
+"""Bias effects of time, of a ring laser's beam monitors and of any other measured column."""
 
 from __future__ import annotations
 
@@ -162,3 +162,40 @@ class BiasColumn(Effect):
         if np.isfinite(float(self.reference)):
             return self
         return eqx.tree_at(lambda e: e.reference, self, jnp.nanmean(signals[self.column]))
+
+
+class BiasBackscatter(BiasColumn):
+    """D += D_B (B − B0): bias proportional to the light that the mirrors of a ring laser scatter back, as monitored.
+
+    Far from rest coupled beams beat slower by ω_L²/2ω, with ω_L² proportional to the scattered power.
+    """
+
+    id = "bias_backscatter"
+    needs = ("backscatter",)
+    cause = "Light that the mirrors scatter back couples the two beams of a ring laser, and slows their beat."
+    test = (
+        "Step the path-length control from mode to mode at constant temperature: backscatter moves, the rest does not."
+    )
+
+    column: str = eqx.field(static=True, default="backscatter")
+
+    @property
+    def label(self) -> str:
+        """The catalogue's id."""
+        return self.id
+
+
+class BiasNullShift(BiasColumn):
+    """D += D_N (N − N0): bias proportional to a monitor of how unequal the two beams of a ring laser are."""
+
+    id = "bias_null_shift"
+    needs = ("null_shift",)
+    cause = "Unequal discharge currents, losses or intensities of the two beams shift their frequencies apart at rest."
+    test = "Unbalance the discharge currents on purpose, at constant temperature: a bias over temperature stays."
+
+    column: str = eqx.field(static=True, default="null_shift")
+
+    @property
+    def label(self) -> str:
+        """The catalogue's id."""
+        return self.id

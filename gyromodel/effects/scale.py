@@ -155,6 +155,73 @@ class ScaleTemperature(OverTemperature):
         return stack(signals["temperature"] - self.reference)
 
 
+class TorquerScale(OverTemperature):
+    """E += (S + ½ S_a sgn i + S_T (T − T0)) i: error of the rate that each unit of the torquer current i stands for.
+
+    A rate-integrating gyro is held, or driven, by the torque of this current. Each list has one coefficient or none.
+    Where the current keeps to the input rate, this is an error of the scale factor, and no size of it tells which.
+    """
+
+    id = "torquer_scale"
+    site = "rate"
+    needs = ("torquer_current",)
+    cause = (
+        "The torquer's magnet or coil gives another torque per ampere, by its sense or temperature, than is assumed."
+    )
+    test = "Turn the table at one torquer current, and torque at one table rate: this error follows the current alone."
+    supersedes = ("torquer_scale",)
+
+    scale: Float[Array, " scale"] = parameter(
+        "deg/h/mA", 1e-3, "rate per unit of current, less the nominal one", default=()
+    )
+    asymmetry: Float[Array, " sense"] = parameter(
+        "deg/h/mA", 1e-3, "of positive less that of negative currents", default=()
+    )
+    temperature: Float[Array, " slope"] = parameter("deg/h/mA/degC", 1e-4, "its change per degree", default=())
+
+    def __post_init__(self) -> None:
+        if not self._sizes().any():
+            self.scale = jnp.zeros(1)
+
+    def __check_init__(self) -> None:
+        if self._sizes().max() > 1:
+            raise ValueError("scale, asymmetry and temperature are lists of one coefficient or of none")
+
+    def _sizes(self) -> np.ndarray:
+        return np.array([np.size(v) for v in (self.scale, self.asymmetry, self.temperature)])
+
+    @property
+    def columns_needed(self) -> tuple[str, ...]:
+        """The temperature too, where the scale changes with it."""
+        return (*self.needs, "temperature") if self.temperature.size else self.needs
+
+    def prepared(self, signals: Signals) -> Self:
+        """Refer to the campaign's mean temperature, if it has any."""
+        if "temperature" in signals or np.isfinite(float(self.reference)):
+            return super().prepared(signals)
+        return eqx.tree_at(lambda e: e.reference, self, jnp.zeros(()))
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """i, |i|/2 and (T − T0) i, those that it has."""
+        current = signals["torquer_current"]
+        each = [current] * self.scale.size + [0.5 * jnp.abs(current)] * self.asymmetry.size
+        return stack(*each, *([(signals["temperature"] - self.reference) * current] * self.temperature.size))
+
+    def joined(self, held: Effect) -> Self:
+        """All coefficients that either has."""
+        sizes = np.maximum(self._sizes(), held._sizes())  # type: ignore[attr-defined]
+        scale, asymmetry, temperature = (jnp.zeros(int(size)) for size in sizes)
+        return type(self)(scale=scale, asymmetry=asymmetry, temperature=temperature, reference=self.reference)
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """One coefficient at a time, as those of the scale factor are that it may be taken for; more may be added."""
+        terms = ["scale", "asymmetry"]
+        if "temperature" in signals and np.ptp(np.asarray(signals["temperature"])) > 0:
+            terms.append("temperature")
+        return [cls(**{term: jnp.zeros(1)}).prepared(signals) for term in terms]
+
+
 class ScaleDrift(Effect):
     """ε += R t: scale factor drifting in proportion to time."""
 

@@ -371,7 +371,7 @@ class BiasTemperatureGradientRate(_BetweenThermometers):
 
 
 class BiasWarmup(Effect):
-    """E += A exp(−t/τ), t from power-on."""
+    """E += Σ A_i exp(−t/τ_i), t from power-on; as many terms as the data ask for."""
 
     id = "bias_warmup"
     site = "rate"
@@ -379,17 +379,29 @@ class BiasWarmup(Effect):
     cause = "Electronics, source or coil settle after power-on."
     test = "Repeat the start: a warm-up comes back, a random walk does not."
     untested = "the run begins so long after power-on that what could be seen to decay in it has decayed before"
+    supersedes = ("bias_warmup",)
 
-    amplitude: Float[Array, ""] = parameter("deg/h", 1.0, "bias at power-on")
-    time_constant: Float[Array, ""] = parameter("s", 600.0, "decay time", linear=False, default=600.0)
+    amplitude: Float[Array, " term"] = parameter("deg/h", 1.0, "bias of each term at power-on", default=(0.0,))
+    time_constant: Float[Array, " term"] = parameter("s", 600.0, "their decay times", linear=False, default=(600.0,))
+
+    def __post_init__(self) -> None:
+        given = (self.amplitude, self.time_constant)
+        self.amplitude, self.time_constant = (jnp.atleast_1d(jnp.asarray(v, float)) for v in given)
 
     def __check_init__(self) -> None:
-        if self.time_constant <= 0:
+        if self.amplitude.shape != self.time_constant.shape or not self.amplitude.size:
+            raise ValueError("every amplitude has a time constant, and there is one at least")
+        if (self.time_constant <= 0).any():
             raise ValueError("a time constant is above zero")
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
-        """The decay."""
-        return stack(jnp.exp(-signals["time_on"] / self.time_constant))
+        """The decays."""
+        return jnp.exp(-signals["time_on"][:, None] / self.time_constant)
+
+    def joined(self, held: Effect) -> Self:
+        """The terms of both."""
+        both = jnp.concatenate([held.time_constant, self.time_constant])  # type: ignore[attr-defined]
+        return type(self)(amplitude=jnp.zeros(both.size), time_constant=both)
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
@@ -397,4 +409,4 @@ class BiasWarmup(Effect):
         on = np.asarray(signals["time_on"])
         span = float(on.max() - on.min())
         shortest = max(span / 200.0, 2.0 * float(np.median(np.diff(on))), float(on.min()) / LONG_OVER)
-        return [] if shortest > span else [cls(time_constant=tau) for tau in np.geomspace(shortest, span, 14)]
+        return [] if shortest > span else [cls(time_constant=tau) for tau in np.geomspace(shortest, span, 14)[:, None]]

@@ -92,6 +92,37 @@ def with_late_thermometer(design: Design, tau: float, rng: np.random.Generator) 
     )
 
 
+def two_nodes(time: Array, chamber: Array, taus: tuple[float, float], share: float) -> tuple[Array, Array]:
+    """Temperatures of a case that the chamber heats and of a sensor on it, which holds back what it takes up.
+
+    C1 dT1/dt = G0 (chamber − T1) + G (T2 − T1), C2 dT2/dt = G (T1 − T2), by implicit Euler.
+
+    Args:
+        time: evenly spaced, s.
+        chamber: its temperature.
+        taus: C1/G0 and C2/G, s.
+        share: C2/C1.
+    """
+    dt = time[1] - time[0]
+    outside, inside = dt / taus[0], dt / taus[1]
+    advance = np.linalg.inv(np.array([[1 + outside + share * inside, -share * inside], [-inside, 1 + inside]]))
+    nodes = np.full((len(time), 2), chamber[0])
+    for i in range(1, len(time)):
+        nodes[i] = advance @ (nodes[i - 1] + [outside * chamber[i], 0.0])
+    return nodes[:, 0], nodes[:, 1]
+
+
+def on_a_case(design: Design, tau: float, rng: np.random.Generator) -> Design:
+    """The design in whose temperature a case stands, which is `coil`, measured by a sensor of a third of its heat."""
+    time, chamber = design.thermal
+    case, shown = (np.interp(design.true["time"], time, node) for node in two_nodes(time, chamber, (300.0, tau), 0.3))
+    return dataclasses.replace(
+        design,
+        columns=design.columns | {"temperature": shown + 2e-3 * rng.standard_normal(len(shown))},
+        true=design.true | {"coil": case, "temperature": shown},
+    )
+
+
 def clipped(rate: Array, limit: float) -> Array:
     """A converter that ends at ± its limit."""
     return np.where(rate > limit, limit, np.where(rate < -limit, -limit, rate))
