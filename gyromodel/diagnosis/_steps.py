@@ -207,14 +207,21 @@ def rows_of(found: Sequence[Found]) -> tuple[int, ...]:
 
 
 def _negative(estimate: Estimate, found: Sequence[Found]) -> bool:
-    """Whether something found is clearly below zero in a coefficient that cannot be."""
-    of = {f.effect.label for f in found if f.effect is not None and f.effect.positive}
-    return any(
-        slot.linear and estimate.model.labels[slot.effect] in of and value < -CLEARLY * std
-        for slot, value, std in zip(
-            estimate.model.slots(), np.asarray(estimate.model.vector()), estimate.std, strict=True
-        )
-    )
+    """Whether something found has a coefficient that cannot be: clearly below zero, or a part beyond its whole."""
+    of, sizes = {f.effect.label: f.effect for f in found if f.effect is not None}, {}
+    model = estimate.model
+    for slot, value, std in zip(model.slots(), np.asarray(model.vector()), estimate.std, strict=True):
+        label = model.labels[slot.effect]
+        if slot.linear and label in of:
+            sizes[label, slot.field, slot.index] = value, std
+            if of[label].positive and value < -CLEARLY * std:
+                return True
+    for (label, name, _), (part, std) in sizes.items():
+        whole, spread = sizes.get((label, of[label].whole, 0), (0.0, np.inf))
+        share = part * np.sign(whole)
+        if name == "part" and min(share, abs(whole) - share) < -CLEARLY * np.hypot(std, spread):
+            return True
+    return False
 
 
 def _entangled(estimate: Estimate) -> bool:

@@ -212,7 +212,8 @@ def judge(
         if bases == ("time",):
             test = "Repeat the run from power-on, everything held: noise does not come back."
         return Judgement("unknown", tuple(causes), {driver: 1.0}, driver, test, unexplained, tuple(findings))
-    if not causes and selection.remains:
+    # Single gross errors are no cause, however many of them a search did not come to.
+    if not causes and selection.remains and (scanner.by_points or selection.remains != "outliers"):
         return Judgement("unknown", (), {selection.remains: 1.0}, None, None, unexplained, tuple(findings))
     if not causes:
         return Judgement("adequate", (), {}, None, None, unexplained, tuple(findings))

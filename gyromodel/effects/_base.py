@@ -69,7 +69,8 @@ class Effect(eqx.Module):
     and may depend on the nonlinear ones; the contribution is columns @ coefficients, so zero coefficients are exactly
     the model without it.
     `supersedes` lists effects that this one contains as a special case; `held` the fields that physics
-    or the search fixes; `positive` says that no coefficient can be negative; `scan` names a fast search over
+    or the search fixes; `positive` says that no coefficient can be negative; `whole` names the coefficient of which the
+    coefficients `part` are shares, from none to all; `scan` names a fast search over
     every epoch or frequency; `untested` says why a campaign leaves it no `candidates`; `remembers` that a sample's
     contribution depends on its neighbours in time; `reach` is the largest amplitude (internal units) of an effect that
     continues others.
@@ -84,6 +85,7 @@ class Effect(eqx.Module):
     supersedes: ClassVar[tuple[str, ...]] = ()
     held: ClassVar[tuple[str, ...]] = ()
     positive: ClassVar[bool] = False
+    whole: ClassVar[str] = ""
     scan: ClassVar[Literal["", "step", "line"]] = ""
     untested: ClassVar[str] = "its driver does not vary"
     remembers: ClassVar[bool] = False

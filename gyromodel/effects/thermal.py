@@ -74,7 +74,8 @@ class BiasTemperatureRate(Effect):
 
     With a lag, of a coil that follows the thermometer through one. Of several lags, each delays a part of it:
     E += D_Ṫ L_0 + Σ D_k (L_k − L_0), L_k the rate dT/dt behind the lag k, so that D_Ṫ is always the bias on a steady
-    ramp. A lag below zero says that the thermometer is later than the coil.
+    ramp. A lag below zero says that the thermometer is later than the coil. Heat that diffuses into a coil makes all of
+    the parts of one sign.
     """
 
     id = "bias_temperature_rate"
@@ -83,6 +84,7 @@ class BiasTemperatureRate(Effect):
     cause = "A temperature front crossing the fiber coil shifts the two counter-propagating phases unequally."
     test = "Two ramp speeds: this error grows with the speed, thermal hysteresis does not."
     supersedes = ("bias_temperature_rate",)
+    whole = "coefficient"
 
     coefficient: Float[Array, ""] = parameter("deg/h/(degC/s)", 1000.0, "bias per unit of temperature rate")
     part: Float[Array, " part"] = parameter("deg/h/(degC/s)", 1000.0, "what of it has each further lag", default=())
@@ -159,6 +161,7 @@ class BiasTemperatureProduct(OverTemperature, BiasTemperatureRate):
     )
     test = "The same ramp at a low and at a high temperature: the Shupe effect is the same in both, this is not."
     supersedes = ("bias_temperature_rate", "bias_temperature_product")
+    whole = "at_reference"
 
     coefficient: Float[Array, ""] = parameter("deg/h/(degC^2/s)", 30.0, "change of the Shupe coefficient per degree")
     at_reference: Float[Array, " reference"] = parameter(
