@@ -71,8 +71,8 @@ def drawn(time: np.ndarray, noise: np.ndarray, known: bool) -> SineFit:
 def test_efficiency_and_coverage(periods: float, known: bool, rng: np.random.Generator):
     """At least 0.999 of the Cramér-Rao bound, and no more than 1; intervals that hold as often as they say.
 
-    An unbiased estimate errs by what the best one does on the same noise and, uncorrelated with that, by an excess whose
-    variance is all that it lacks: 1200 draws tell it as well as a hundred thousand tell the variance as a whole.
+    An unbiased estimate errs by what the best one does on the same noise and, uncorrelated with that, by an excess
+    whose variance is all that it lacks: 1200 draws tell more of it than a hundred thousand do of the variance itself.
     """
     time, noise = grid(periods), rng.standard_normal((2, DRAWS, SAMPLES))
     found, least = drawn(time, noise, known), bound(time, known)
