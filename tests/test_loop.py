@@ -169,7 +169,7 @@ def test_one_time_offset_by_hand():
 
 @pytest.mark.long
 def test_the_committed_ranking_is_that_of_the_fits():
-    """Each alternative that the printed table determines is a row of the result; the first four are those of the page."""
+    """Each alternative that the printed table determines is a row of the result; the first four are the page's."""
     root = Path(__file__).parents[1]
     result = (root / "benchmarks/results/vibration.md").read_text(encoding="utf-8")
     lines = result.partition("| alternative |")[2].partition("\n\n")[0].splitlines()[2:]
