@@ -65,9 +65,10 @@ def by_rates(campaigns: list[gyromodel.Campaign]) -> list[list[str]]:
             raise SystemExit("no lie of the axes")
         rotation, square = found.rotation_covariance, found.squareness_covariance
         said = [w for w, yes in (("mounting", found.turned), ("non-orthogonality", found.oblique)) if yes]
+        told = "not told" if found.not_told else " and ".join(said) or "neither"
         rows.append([
             f"{angle:g} deg", listed(found.rotation, rotation), chance(found.rotation, rotation),
-            listed(found.squareness, square), chance(found.squareness, square), " and ".join(said) or "neither",
+            listed(found.squareness, square), chance(found.squareness, square), told,
         ])  # fmt: skip
     return rows
 
@@ -95,7 +96,11 @@ def commanded(path: Path, folder: Path) -> list[str]:
     if not result:
         raise SystemExit(refusal)
     lie = result["triad"]
-    words = "not told" if lie is None else str({part: lie[part]["significant"] for part in ("rotation", "squareness")})
+    words = (
+        "not told"
+        if lie is None or lie["not_told"]
+        else str({part: lie[part]["significant"] for part in ("rotation", "squareness")})
+    )
     return [*(causes(result["axes"][axis]) for axis in AXES), words, f"{seconds:.0f}"]
 
 
@@ -106,7 +111,8 @@ def main() -> None:
         "Whether a mounting is taken for axes that are not at right angles. *Rotation* is that of the three axes "
         f"together about x, y, z; *squareness* what {pairs} lack of a right angle; arcsec with standard uncertainties, "
         "and the chance that noise alone does as much (3 degrees of freedom; below 1e-3 it is told). Each axis has a "
-        "bias, a scale factor and leans towards both others. *Mounting added*: the reference turned by this much about "
+        "bias, a scale factor and leans towards both others. Where the unit turns about one axis at a tenth or less of "
+        "another's rate, neither is told. *Mounting added*: the reference turned by this much about "
         "x, y and z each, which takes as much from the rotation and leaves the squareness, but for the second order. "
         "The last row of a session has the same angles from another fit, through the integrator to where windows end "
         f"(`attitude_real`), leans and mounting within {ALIKE['lean']:g} rad alike.",

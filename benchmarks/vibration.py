@@ -99,13 +99,11 @@ def table_of_explanations() -> tuple[list[list[str]], dict[str, Any]]:
     best = [min(e.criterion for e in group.values()) for group in (same, growing)]
     rows, inertia = [], float(Loop().inertia)
     for name, e in sorted(same.items(), key=lambda item: item[1].criterion):
-        if name not in growing:
-            continue
         rows.append(
             [
                 name,
                 f"{e.criterion - best[0]:.1f}",
-                f"{growing[name].criterion - best[1]:.1f}",
+                f"{growing[name].criterion - best[1]:.1f}" if name in growing else "not determined",
                 f"{e.scatter[0]:.3f}, {e.scatter[1]:.2f}",
                 _entries(e, slice(0, 3), 1e3),
                 _entries(e, slice(3, 6), 1 / inertia),
@@ -180,8 +178,8 @@ def main(argv: list[str] | None = None) -> None:
         "phases, and with one that grows as 1 + ω s. Values are of equal scatter; time offset in ms, friction c/J of "
         "X, Y, Z in 1/s, dry friction M/J in 1e-3 rad/s², compliance 1/ω_n² of X, Y, Z in 1e-6 s², lag 2ζ/ω_n in ms, "
         "corner of the integration in rad/s, where it is fitted. What would be negative is held at zero; what the "
-        "points do not determine is not listed. Friction acts through the default loop unless said: integration from "
-        "40 rad/s down; quick, from 120 rad/s; double, twice from 48 rad/s.",
+        "points do not determine with equal scatter is not listed. Friction acts through the default loop unless said: "
+        "integration from 40 rad/s down; quick, from 120 rad/s; double, twice from 48 rad/s.",
         "",
         *table(
             [

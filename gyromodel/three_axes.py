@@ -19,6 +19,9 @@ from gyromodel.units import factor
 
 # A rotation or a deviation from right angles is one beyond this chance.
 SIGNIFICANT = 1e-3
+# Part of the fastest axis' rotation (rms) below which another hardly turns: what a reference errs by goes with the
+# fastest, moves with it as no noise does, and is then as large as what leans are told by.
+HARDLY = 0.1
 # Pairs of axes as deviations from right angles are listed: xy, yz, zx.
 PAIRS = ((0, 1), (1, 2), (2, 0))
 
@@ -30,25 +33,29 @@ class Triad:
     Attributes:
         rotation: by which the three axes are turned together about x, y and z: what another mounting takes away.
         squareness: by how much less than a right angle x and y, y and z, z and x enclose: what no mounting changes.
+        not_told: why the covariances are not to be believed; empty where they are.
     """
 
     rotation: Float[np.ndarray, " axis"]
     rotation_covariance: Float[np.ndarray, "axis axis"]
     squareness: Float[np.ndarray, " axis"]
     squareness_covariance: Float[np.ndarray, "axis axis"]
+    not_told: str = ""
 
     @property
     def turned(self) -> bool:
         """Whether the axes are turned together, beyond what noise makes."""
-        return _stands_out(self.rotation, self.rotation_covariance)
+        return not self.not_told and _stands_out(self.rotation, self.rotation_covariance)
 
     @property
     def oblique(self) -> bool:
         """Whether they are not at right angles, beyond what noise makes."""
-        return _stands_out(self.squareness, self.squareness_covariance)
+        return not self.not_told and _stands_out(self.squareness, self.squareness_covariance)
 
     def sentence(self) -> str:
         """What the axes say together."""
+        if self.not_told:
+            return f"How the axes lie together is not told: {self.not_told}."
         turned = f"turned as a whole by {_listed(self.rotation, self.rotation_covariance, 'xyz')}"
         oblique = f"short of right angles by {_listed(self.squareness, self.squareness_covariance, ('xy', 'yz', 'zx'))}"
         if self.turned and self.oblique:
@@ -69,6 +76,7 @@ class Triad:
             return {"significant": found, "unit": "arcsec", **each}
 
         return {
+            "not_told": self.not_told or None,
             "rotation": part(self.rotation, self.rotation_covariance, "xyz", self.turned),
             "squareness": part(self.squareness, self.squareness_covariance, ("xy", "yz", "zx"), self.oblique),
         }
@@ -105,7 +113,22 @@ def triad(campaigns: Sequence[Campaign], extended: Mapping[str, Estimate]) -> Tr
         turn[3 - i - j, [3 * i + j, 3 * j + i]] = 0.5, -0.5
         square[k, [3 * i + j, 3 * j + i]] = 1.0
     flat = lean.ravel()
-    return Triad(turn @ flat, turn @ covariance @ turn.T, square @ flat, square @ covariance @ square.T)
+    return Triad(
+        turn @ flat, turn @ covariance @ turn.T, square @ flat, square @ covariance @ square.T, _hardly_turned(rated)
+    )
+
+
+def _hardly_turned(rated: Sequence[Campaign]) -> str:
+    """Which axis the unit hardly turned about, beside another; empty where there is none."""
+    rates = np.stack([np.concatenate([c.si(f"rate_{a}") for c in rated]) for a in AXES])
+    size = np.sqrt(np.nanmean(rates**2, axis=1)) * factor("rad/s", "deg/s")
+    least, most = int(size.argmin()), int(size.argmax())
+    if size[least] > HARDLY * size[most]:
+        return ""
+    return (
+        f"the rotation about {AXES[least]} ({size[least]:.2g} deg/s rms) is a tenth or less of that about {AXES[most]} "
+        f"({size[most]:.2g} deg/s), so that errors of the reference pass for leans; turn the unit about all three axes"
+    )
 
 
 def _stands_out(values: np.ndarray, covariance: np.ndarray) -> bool:

@@ -3,12 +3,16 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from pathlib import Path
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+from gyromodel.estimate import EstimateError
 from gyromodel.platform import (
     ALTERNATIVES,
     FREQUENCIES,
@@ -161,6 +165,25 @@ def test_one_time_offset_by_hand():
     assert found.scatter == pytest.approx([np.sqrt(np.mean(PRINTED[0] ** 2)), scatter], rel=1e-6)
     squares = np.mean(PRINTED[0] ** 2), np.mean(left**2)
     assert found.criterion == pytest.approx(12 * np.log(squares).sum() + 2 * 3 + 2 * 3 * 4 / 20)
+
+
+@pytest.mark.long
+def test_the_committed_ranking_is_that_of_the_fits():
+    """Each alternative that the printed table determines is a row of the result; the first four are the page's."""
+    root = Path(__file__).parents[1]
+    result = (root / "benchmarks/results/vibration.md").read_text(encoding="utf-8")
+    lines = result.partition("| alternative |")[2].partition("\n\n")[0].splitlines()[2:]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    found = {}
+    for name, alternative in ALTERNATIVES.items():
+        with suppress(EstimateError):
+            found[name] = explain(alternative, points(FREQUENCIES), *PRINTED).criterion
+    order = sorted(found, key=lambda name: found[name])
+    assert [row[0] for row in rows] == order
+    page = (root / "docs/cases/angular_vibration_table.md").read_text(encoding="utf-8")
+    told = page.partition("| explanation |")[2].partition("\n\n")[0].splitlines()[2:6]
+    for row, line, name in zip(rows[:4], told, order, strict=False):
+        assert row[1] == line.split("|")[2].strip() == f"{found[name] - found[order[0]]:.1f}"
 
 
 def test_causes_are_found_again(rng: np.random.Generator):

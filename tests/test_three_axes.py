@@ -23,16 +23,18 @@ from gyromodel.three_axes import Triad, triad
 
 ARCSEC = np.deg2rad(1 / 3600)
 ROWS = 240
+# About x, y and z, deg/s.
+TURNS = np.full(3, 60.0)
 
 
-def rates(rng: np.random.Generator) -> np.ndarray:
-    """Turns about each axis and all of them, in steps."""
-    return np.deg2rad(60.0) * rng.uniform(-1, 1, (ROWS // 4, 3)).repeat(4, axis=0)
+def rates(rng: np.random.Generator, size: np.ndarray) -> np.ndarray:
+    """Turns about each axis and all of them, in steps (deg/s)."""
+    return np.deg2rad(size) * rng.uniform(-1, 1, (ROWS // 4, 3)).repeat(4, axis=0)
 
 
-def measured(axes: np.ndarray, rng: np.random.Generator) -> Campaign:
+def measured(axes: np.ndarray, rng: np.random.Generator, size: np.ndarray = TURNS) -> Campaign:
     """Outputs of three unit vectors' rates, each with a bias and white noise."""
-    rate = rates(rng)
+    rate = rates(rng, size)
     output = rate @ axes.T + np.deg2rad([20.0, -10.0, 5.0]) / 3600 + 2e-5 * rng.standard_normal((ROWS, 3))
     columns = {"time": np.arange(ROWS) * 1.0}
     columns |= {f"rate_{a}": np.rad2deg(rate[:, i]) for i, a in enumerate("xyz")}
@@ -40,8 +42,8 @@ def measured(axes: np.ndarray, rng: np.random.Generator) -> Campaign:
     return Campaign(columns, {n: "s" if n == "time" else "deg/s" for n in columns}, {"kind": "rate"})
 
 
-def lie(axes: np.ndarray, rng: np.random.Generator) -> Triad:
-    campaign = measured(axes, rng)
+def lie(axes: np.ndarray, rng: np.random.Generator, size: np.ndarray = TURNS) -> Triad:
+    campaign = measured(axes, rng, size)
     found = triad([campaign], {a: fit(campaign.axis(a), model_from_effects(["scale_factor", "bias"])) for a in "xyz"})
     assert found is not None
     return found
@@ -66,6 +68,18 @@ def test_axes_that_are_not_square_are_the_unit(rng: np.random.Generator):
     assert found.oblique
     assert np.abs(found.squareness - np.array([400.0, 0, 0]) * ARCSEC).max() < 6 * std.max()
     assert "which is the unit" in found.sentence()
+
+
+def test_a_lean_wants_all_three_axes_turned(rng: np.random.Generator):
+    """An axis 400 arcsec off its right angles is told of by a third of the fastest rotation, and not by a twentieth."""
+    axes = np.eye(3)
+    axes[0] = Rotation.from_rotvec([0, 0, 400 * ARCSEC]).apply([1.0, 0, 0])
+    assert lie(axes, rng, np.array([60.0, 60.0, 20.0])).oblique
+    still = lie(axes, rng, np.array([60.0, 60.0, 3.0]))
+    assert not still.oblique
+    assert not still.turned
+    assert "not told: the rotation about z" in still.sentence()
+    assert str(still.to_dict()["not_told"]) in still.sentence()
 
 
 @pytest.mark.long

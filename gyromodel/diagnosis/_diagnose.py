@@ -69,7 +69,16 @@ class _Session:
                 driver = significant_driver(ranking, self.threshold, self.scanner.runs)
                 if driver and ranking.statistic[driver] < ranking.statistic[step.name] + EXCHANGE:
                     driver = None
-                cut = Selection(estimates[-1], found, path, ranking, estimates, driver, remains=step.name)
+                cut = Selection(
+                    estimates[-1],
+                    found,
+                    path,
+                    ranking,
+                    estimates,
+                    driver,
+                    remains=step.name,
+                    beside_it=selection.estimates[i],
+                )
                 return steadied(Steps(self.scanner, estimates[0], self.threshold), cut)
         return selection
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import stats
 
 from gyromodel.diagnosis._result import Gain
-from gyromodel.estimate import Estimate, EstimateError, filter_of, fit_record, whiten_columns
+from gyromodel.estimate import Estimate, EstimateError, filter_of, fit_record, pad_columns, whiten_columns
 from gyromodel.signals import Record
 
 # Ordinary weights replace the noise model's where they lower the held-out rms to less than this part.
@@ -36,15 +36,18 @@ def folds_of(record: Record) -> tuple[list[np.ndarray], str]:
 
 
 def held_out(record: Record, train: Estimate, rows: np.ndarray) -> tuple[np.ndarray, float]:
-    """Errors of a fold (as a rate) by a model fitted without it, and its log score given the other folds' noise.
+    """Errors of a fold (as a rate) by a model fitted without it, and its log score given the other folds.
 
-    What a position tells is in its mean, so that of positions the error of each mean counts.
+    What a position tells is in its mean, so that of positions the error of each mean counts. The score allows for what
+    the other folds leave open of the parameters: a block that alone tells a friction about its axis is then a wide
+    prediction, and no failed one.
     """
-    predicted = np.asarray(train.model.predict(record.signals))
+    predicted, jacobian = (np.asarray(part) for part in train.model.linearise(record.signals))
     slope = np.asarray(train.model.slope(record.signals))
     residual = np.asarray(record.signals["output"]) - predicted
-    with_fold = _log_density(record, residual, train)
-    without = _log_density(record.without(rows), residual, train)
+    columns = np.column_stack([jacobian, residual])
+    with_fold = _log_density(record, columns, train)
+    without = _log_density(record.without(rows), columns, train)
     errors = residual[rows] / slope[rows]
     if record.block_scheme == POSITIONS:
         number = np.unique(record.blocks[rows], return_inverse=True)[1]
@@ -52,15 +55,20 @@ def held_out(record: Record, train: Estimate, rows: np.ndarray) -> tuple[np.ndar
     return errors, with_fold - without
 
 
-def _log_density(record: Record, residual: np.ndarray, estimate: Estimate) -> float:
+def _log_density(record: Record, columns: np.ndarray, estimate: Estimate) -> float:
+    """ln ∫ p(output | θ) dθ but for a constant, of a Jacobian and a residual side by side, in the estimate's noise."""
     filter = filter_of(record, estimate.ratios)
     present = np.asarray(record.sampling.present)
-    w = np.asarray(whiten_columns(filter, np.where(present, residual, 0.0)[:, None]))[:, 0]
+    whitened = whiten_columns(filter, pad_columns(np.where(present[:, None], columns, 0.0)))
+    w = np.asarray(whitened)[present, : columns.shape[1]]
+    # Of the triangle that is left, the last entry is the rest that no parameters take up, the others their precision.
+    *precision, rest = np.abs(np.diag(np.linalg.qr(w, mode="r")))
     variance = estimate.white_variance
     return float(
-        -0.5 * np.sum(w**2) / variance
+        -0.5 * rest**2 / variance
+        - np.sum(np.log(precision))
         - 0.5 * filter.log_determinant
-        - 0.5 * present.sum() * np.log(2 * np.pi * variance)
+        - 0.5 * len(w) * np.log(2 * np.pi * variance)
     )
 
 

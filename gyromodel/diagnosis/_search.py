@@ -37,7 +37,8 @@ class Selection:
     """Where the rounds ended: the extended fit, what was added, and the ranking in which no more was significant.
 
     `left_out` holds rankings beside everything found except one, where the search has made them; `remains` names what
-    was still significant and not added, `unresolved` says why if it is too small.
+    was still significant and not added, `beside_it` is the fit with it where there is one, and `unresolved` says why if
+    it is too small.
     """
 
     estimate: Estimate
@@ -49,6 +50,7 @@ class Selection:
     left_out: dict[int, Ranking] = field(default_factory=dict, repr=False)
     remains: str = ""
     unresolved: str = ""
+    beside_it: Estimate | None = field(default=None, repr=False)
 
 
 def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selection:

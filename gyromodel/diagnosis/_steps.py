@@ -136,7 +136,7 @@ class Steps:
         """Whether some steps fit better than others, on the data that both keep."""
         given_up = Found("", None, rows_of([*found, *other]), found[0].ranking)
         one, two = (self.fit([*steps, given_up]) for steps in (found, other))
-        return one is not None and (two is None or _quality(one) > _quality(two))
+        return one is not None and (two is None or bool(_quality(one) > _quality(two)))
 
     def _has_shape(self, name: str) -> bool:
         """Whether a candidate's shape goes on between the forms searched; a fit of a platform takes too long for it."""

@@ -196,7 +196,8 @@ def judge(
     if selection.remains and not selection.unresolved:
         findings.append(
             f"More remains than was named: {selection.remains} is still significant (ln B = "
-            f"{selection.last.statistic.get(selection.remains, np.nan):.0f}) and was not added."
+            f"{selection.last.statistic.get(selection.remains, np.nan):.0f}) and was not added. All values are those "
+            f"without it{_moved(extended, selection.beside_it)}."
         )
     driver, share = remaining(scanner, baseline, selection)
     unexplained = {" and ".join(smooth_columns(driver)): share} if driver else {}
@@ -269,6 +270,18 @@ def _fitted(cause: Cause) -> list[ParameterValue]:
 
 def _sized(parameter: ParameterValue) -> bool:
     return bool(0.0 < VAGUE * parameter.std < abs(parameter.value))
+
+
+def _moved(estimate: Estimate, other: Estimate | None) -> str:
+    """What other values another fit has, of those that it moves by more than chance."""
+    there = {(r.effect, r.name): r for r in other.table()} if other else {}
+    pairs = [(r, there[r.effect, r.name]) for r in estimate.table() if (r.effect, r.name) in there]
+    said = [
+        f"{r.name} of {r.effect} would be ({o.value:.5g} ± {o.std:.2g}) {o.unit}"
+        for r, o in pairs
+        if r.std and abs(o.value - r.value) > VAGUE * r.std
+    ]
+    return f"; with it {listed(said)}" if said else ""
 
 
 def _places(rows: Sequence[int], searched: Sequence[tuple[Campaign, bool]]) -> str:

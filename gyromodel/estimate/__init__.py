@@ -9,6 +9,7 @@ from gyromodel.estimate._fit import (
     fit_record,
     given_ratios,
     make_filter,
+    pad_columns,
     read_for_fit,
     whiten_columns,
 )
@@ -33,6 +34,7 @@ __all__ = [
     "given_ratios",
     "make_filter",
     "noise_table",
+    "pad_columns",
     "read_for_fit",
     "two_stage",
     "validity_unit",

@@ -1,0 +1,113 @@
+"""What blocks left out say of a step: scores against dense algebra, causes that one block alone determines."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gyromodel as gm
+from gyromodel.diagnosis import _diagnose
+from gyromodel.diagnosis._gain import held_out
+from gyromodel.estimate import fit_record
+from gyromodel.model import record_span
+from gyromodel.noise import NoiseRatios
+from gyromodel.signals import read_signals
+from tests.test_diagnosis import dense_covariance
+
+RUNS, ROWS = 4, 80
+# Of the temperature's bias (deg/s/°C), and of the input axis towards two cross rates (rad).
+WARM, LEANS = 1e-2, np.array([5e-4, 4e-4])
+
+
+@pytest.fixture
+def seed() -> int:
+    """One draw, the same in each run: verdicts err as often as the threshold allows, which test_discovery measures."""
+    return 1
+
+
+def log(rng: np.random.Generator, throughout: bool = False) -> gm.Campaign:
+    """Runs in one of which the unit turns about y, and in another about z: each lean is determined by one block.
+
+    `throughout`: it turns about both in all of them, by more where it is warm.
+    """
+    run = np.repeat(np.arange(1.0, RUNS + 1), ROWS)
+    row = np.arange(len(run))
+    time = 10.0 * row + 2000 * (run - 1)
+    temperature = 20 + 10 * np.sin(time / 1300) + 0.01 * rng.standard_normal(len(run))
+    rate = np.tile(np.repeat([-10.0, 0.0, 10.0, 5.0], ROWS // 4), RUNS)
+    cross = np.stack([np.where(run == k, 10 * np.sin(row / 7), 0.0) for k in (2, 3)], 1)
+    cross += 0.02 * rng.standard_normal(cross.shape)
+    if throughout:
+        cross = 2 * rng.standard_normal(cross.shape) + 0.1 * (temperature[:, None] - 20)
+    output = rate + 0.02 + WARM * (temperature - 20) + cross @ LEANS + 1e-3 * rng.standard_normal(len(run))
+    columns = {"time": time, "segment": run, "rate": rate, "rate_y": cross[:, 0], "rate_z": cross[:, 1]}
+    columns |= {"temperature": temperature, "output": output}
+    units = {name: {"time": "s", "segment": "", "temperature": "degC"}.get(name, "deg/s") for name in columns}
+    return gm.Campaign(columns, units, {"kind": "rate"})
+
+
+@pytest.mark.parametrize("walk", [0.0, 0.01])
+def test_scores_equal_dense_algebra(rng: np.random.Generator, walk: float):
+    """The density of a block predicted from the others by universal kriging."""
+    record = read_signals([log(rng)])
+    rows = np.flatnonzero(record.blocks == record.blocks[ROWS])
+    ratios = NoiseRatios(np.array(0.05), np.array(walk))
+    train = fit_record(record.without(rows), gm.model_from_effects(["bias", "bias_temperature"]), ratios=ratios)
+    errors, score = held_out(record, train, rows)
+    time = np.asarray(record.signals["time"])[: record.rows]
+    run = np.zeros(record.rows)
+    noise = dense_covariance(ratios, record.interval, record_span(record), time, run) * train.white_variance
+    predicted, columns = (np.asarray(part)[: record.rows] for part in train.model.linearise(record.signals))
+    residual = np.asarray(record.signals["output"])[: record.rows] - predicted
+    others = np.setdiff1d(np.arange(record.rows), rows)
+    weights = np.linalg.solve(noise[np.ix_(others, others)], noise[np.ix_(others, rows)]).T
+    inverse = np.linalg.inv(noise[np.ix_(others, others)])
+    left = columns[rows] - weights @ columns[others]
+    unknown = np.linalg.inv(columns[others].T @ inverse @ columns[others])
+    fitted = unknown @ columns[others].T @ inverse @ residual[others]
+    spread = noise[np.ix_(rows, rows)] - weights @ noise[np.ix_(others, rows)] + left @ unknown @ left.T
+    wrong = residual[rows] - left @ fitted - weights @ residual[others]
+    expected = -0.5 * (wrong @ np.linalg.solve(spread, wrong) + np.linalg.slogdet(2 * np.pi * spread)[1])
+    assert score == pytest.approx(expected, rel=1e-6)
+    assert errors == pytest.approx(residual[rows])
+
+
+def test_what_one_block_alone_determines_is_not_cut(rng: np.random.Generator):
+    """The error on blocks left out rises with both leans, as the others leave each of them open."""
+    found = gm.diagnose(log(rng), gm.model_from_effects(["scale_factor", "bias"]))
+    assert found.verdict == "named"
+    assert [step.added for step in found.rounds[1:]] == ["bias_temperature", "misalignment"]
+    assert found.rounds[2].held_out > found.rounds[1].held_out
+    assert found.rounds[2].log_score > found.rounds[1].log_score
+    assert not any("More remains" in line for line in found.findings)
+    leans = found.causes[[c.effect for c in found.causes].index("misalignment")].parameters
+    for parameter, lean in zip(leans, np.rad2deg(LEANS) * 3600, strict=True):
+        assert abs(parameter.value - lean) < 5 * parameter.std < abs(lean)
+
+
+def test_values_beside_what_was_cut_say_so(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch):
+    """A cut by force: the coefficient over temperature takes up a part of the leans, and what it would be is told."""
+    forced = lambda record, estimate: (p := float(len(estimate.model.slots())), -p, False)  # noqa: E731
+    monkeypatch.setattr(_diagnose, "ladder_error", forced)
+    found = gm.diagnose(log(rng, throughout=True), gm.model_from_effects(["scale_factor", "bias"]))
+    assert [c.effect for c in found.causes] == ["bias_temperature"]
+    (said,) = (line for line in found.findings if line.startswith("More remains"))
+    assert "misalignment is still significant" in said
+    assert "All values are those without it; with it" in said
+    found_there = re.search(r"coefficient of bias_temperature would be \((\S+) ± (\S+)\) deg/h/degC", said)
+    assert found_there
+    value, std = map(float, found_there.groups())
+    assert abs(value - 3600 * WARM) < 5 * std < 1.0
+
+
+@pytest.mark.long
+def test_friction_that_one_run_of_each_axis_shows_is_not_cut():
+    """Six runs of the embedded log: cut, the friction's lag made the delay 2.087 ± 0.002 ms for 2."""
+    whole = gm.read_campaign(Path(gm.__file__).parent / "data" / "platform_vibration.csv.gz")
+    found = gm.diagnose(whole.select(np.isin(whole.columns["segment"], [1, 4, 5, 8, 9, 12])), gm.model_from_effects([]))
+    assert {cause.effect for cause in found.causes} == {"sync_delay", "shaft_friction"}
+    (delay,) = (p for c in found.causes for p in c.parameters if p.name == "delay")
+    assert abs(delay.value - 2.0) < 4 * delay.std < 0.02
