@@ -213,6 +213,13 @@ def judge(
         if bases == ("time",):
             test = "Repeat the run from power-on, everything held: noise does not come back."
         return Judgement("unknown", tuple(causes), {driver: 1.0}, driver, test, unexplained, tuple(findings))
+    more = selection.last.statistic.get(selection.remains or "", -np.inf)
+    if any(c.effect == selection.remains and more > c.statistic for c in causes):
+        # The name holds less of what is there than it leaves, in a form that it cannot have.
+        driver, score = selection.last.best(drivers=True)
+        driver = driver if score > steps.threshold else None
+        leading = {driver or str(selection.remains): 1.0}
+        return Judgement("unknown", tuple(causes), leading, driver, None, unexplained, tuple(findings))
     # Single gross errors are no cause, however many of them a search did not come to.
     if not causes and selection.remains and (scanner.by_points or selection.remains != "outliers"):
         return Judgement("unknown", (), {selection.remains: 1.0}, None, None, unexplained, tuple(findings))
