@@ -83,13 +83,27 @@ def dwells_apart(estimate: Estimate, unit: str) -> str | None:
     return f"{some} apart from all others ({told}{', …' if len(apart) > DWELLS_TOLD else ''}):{why} repeat these rates."
 
 
+def levels(record: Record, points: Sequence[np.ndarray]) -> np.ndarray:
+    """Each point's rate, as a number that visits of one rate share."""
+    if "rate" not in record.signals:
+        return np.zeros(len(points), int)
+    rate = np.asarray(record.signals["rate"])
+    each = np.array([rate[p[0]] for p in points])
+    order, found = np.argsort(each), np.zeros(len(points), int)
+    found[order[1:]] = np.cumsum(np.diff(each[order]) > 1e-3 * np.ptp(rate[: record.rows]))
+    return found
+
+
 def suspects(
-    points: Sequence[np.ndarray], columns: np.ndarray, residuals: np.ndarray, most: int, least: float
+    points: Sequence[np.ndarray], level: np.ndarray, columns: np.ndarray, residuals: np.ndarray, most: int, least: float
 ) -> list[np.ndarray]:
     """Of each residual, the most anomalous points in the order of a robust fit; none where none is so by `least`.
 
+    They end where no good visit of a rate would be left of several: what comes back is no anomaly.
+
     Args:
         points: the rows of each.
+        level: the rate of each, by number.
         columns: what is fitted.
         residuals: one a column.
         most: how many at most.
@@ -99,7 +113,18 @@ def suspects(
         return [np.zeros(0, int)] * residuals.shape[1]
     fitted, data = (np.stack([x[p].mean(axis=0) for p in points]) for x in (columns, residuals))
     orders = (robust_order(fitted, y) for y in data.T)
-    return [order[: most if score >= least else 0] for order, score in orders]
+    return [_not_returning(order[: most if score >= least else 0], level) for order, score in orders]
+
+
+def _not_returning(order: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """The first of an order that leave a good visit of each rate visited again."""
+    left = np.bincount(level)
+    once = left == 1
+    for i, k in enumerate(order):
+        left[level[k]] -= 1
+        if not left[level[k]] and not once[level[k]]:
+            return order[:i]
+    return order
 
 
 def robust_order(columns: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float]:
@@ -114,6 +139,8 @@ def robust_order(columns: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float]
     u, size, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
     u = u[:, size > 1e-9]
     n, p = u.shape
+    if n < 2 * p:
+        return np.zeros(0, int), 0.0
     if comb(n, p) <= FITS:
         through = np.array(list(combinations(range(n), p)), int)
     else:

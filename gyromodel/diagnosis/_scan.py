@@ -22,7 +22,7 @@ from gyromodel.diagnosis._bank import Bank
 from gyromodel.diagnosis._cells import Cell, Cells
 from gyromodel.diagnosis._evidence import log_evidence_ratio, log_mean, log_mean_of_parts
 from gyromodel.diagnosis._lines import PEAK_WIDTH, PEAKS, Line, line_grid
-from gyromodel.diagnosis._points import MOST_APART, MOST_POINTS, SUSPECT, suspects, test_points
+from gyromodel.diagnosis._points import MOST_APART, MOST_POINTS, SUSPECT, levels, suspects, test_points
 from gyromodel.diagnosis._tangents import VANISHED, Tangent, add_tangents
 from gyromodel.noise import NoiseGrid
 from gyromodel.signals import Record
@@ -234,10 +234,13 @@ class Scanner:
         p, first = jacobian.shape[1], len(tangents)
         # What follows a line closely is a line that is not steady, and no other line.
         barred = self.lines.barred(lines) if self.lines else np.zeros(0, bool)
-        points = [p for p in (np.setdiff1d(p, given_up) for p in self.points) if len(p)]
+        # Once: of what several sets leave, the rest of a curve would be the next.
+        points = [] if self.points_among(given_up) else self.points
         most = int(len(points) * (MOST_POINTS if self.by_points else MOST_APART))
         least_score = 0.0 if self.by_points else SUSPECT
-        orders = suspects(points, jacobian[:, : p - len(given_up)], residuals, most, least_score)
+        orders = suspects(
+            points, levels(self.record, points), jacobian[:, : p - len(given_up)], residuals, most, least_score
+        )
 
         def search(group: Sequence[int]) -> list[Batch]:
             z, cross = self.cells.inner_products(group, stacked)
@@ -396,12 +399,13 @@ class Scanner:
             batch.evidence["outliers"], batch.best["outliers"] = evidence, (best, explained, dimension)
             batch.energy["outliers"] = np.diag(left)
             return
-        single, (rows, *sums) = batch.evidence["outliers"], batch.best["outliers"]
+        single, (rows, alone, one) = batch.evidence["outliers"], batch.best["outliers"]
         whole = evidence > single
         batch.evidence["outliers"] = np.logaddexp(single, evidence)
         batch.best["outliers"] = (
             [b if w else r for w, b, r in zip(whole, best, rows, strict=True)],
-            *(np.where(whole, *pair) for pair in zip((explained, dimension), sums, strict=True)),
+            np.where(whole, explained, alone),
+            np.where(whole, dimension, one),
         )
 
     def _lines(self, batch: Batch, g: int, zj: np.ndarray, zy: np.ndarray, nu: int, barred: np.ndarray) -> None:

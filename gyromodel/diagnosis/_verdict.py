@@ -15,6 +15,7 @@ from gyromodel.diagnosis._apart import like, separation, twins
 from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._evidence import log_evidence_ratio
 from gyromodel.diagnosis._exchange import uncontested
+from gyromodel.diagnosis._points import levels
 from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, ease, is_driver, is_noise
 from gyromodel.diagnosis._result import Cause, Confuser, ParameterValue, Verdict
 from gyromodel.diagnosis._scan import Scanner
@@ -126,9 +127,10 @@ def judge(
     dwells = [] if scanner.by_points else scanner.points_among(given_up)
     if dwells:
         what = f"{len(dwells)} whole dwells, which begin" if len(dwells) > 1 else "A whole dwell, which begins"
-        findings.append(f"{what} {_places([d[0] for d in dwells], searched)}: given up, not modelled.")
-    errors = [] if scanner.by_points else np.setdiff1d(given_up, np.concatenate([[], *dwells])).astype(int)
-    if len(errors):
+        findings.append(f"{what} {_places([int(d[0]) for d in dwells], searched)}: given up, not modelled.")
+    of_dwells = {int(row) for dwell in dwells for row in dwell}
+    errors = [] if scanner.by_points else [row for row in given_up if row not in of_dwells]
+    if errors:
         what = f"{len(errors)} gross errors" if len(errors) > 1 else "A gross error"
         findings.append(f"{what} {_places(errors, searched)}: given up, not modelled.")
     for one, other in zip(selection.path, selection.path[1:], strict=False):
@@ -165,8 +167,13 @@ def judge(
         # What was not added may stand in the place of this.
         members = credible(scanner, ranking, name, statistic, beside=beside - {selection.remains})
         if name == "outliers":
-            if _unrepeated(scanner, step.points):
-                members = {k: 0.5 * share for k, share in members.items()} | {"scale_spline": 0.5}
+            bad = np.array([np.isin(p, step.points).all() for p in scanner.points], bool)
+            in_a_row = not scanner.by_points and (bad[:-2] & bad[1:-1] & bad[2:]).any()
+            doubts = {"scale_spline": _unrepeated(scanner, bad), "bias_step": in_a_row and scanner.steps}
+            rivals = [k for k, possible in doubts.items() if possible]
+            if rivals:
+                own = {k: 0.5 * share for k, share in members.items()}
+                members = own | {k: 0.5 / len(rivals) + own.get(k, 0.0) for k in rivals}
             elif not scanner.by_points:
                 continue
         if isinstance(step.effect, BiasPeriodic) and _of_rounding(extended):
@@ -325,15 +332,12 @@ def _as_set(cause: Cause, members: dict[str, float]) -> tuple[Cause, ...]:
     return (cause, *others)
 
 
-def _unrepeated(scanner: Scanner, rows: tuple[int, ...]) -> bool:
+def _unrepeated(scanner: Scanner, bad: np.ndarray) -> bool:
     """Whether some anomalous point's rate has fewer than two good points, so that a curve through it is possible."""
     if "rate" not in scanner.record.signals:
         return False
-    rate = np.asarray(scanner.record.signals["rate"])
-    tolerance = 1e-3 * np.ptp(rate[: scanner.record.rows]) + 1e-12
-    each = np.array([rate[p[0]] for p in scanner.points])
-    bad = np.array([np.isin(p, rows).all() for p in scanner.points], bool)
-    return any(np.sum(np.abs(each[~bad] - r) < tolerance) < 2 for r in each[bad])
+    level = levels(scanner.record, scanner.points)
+    return any(np.sum(level[~bad] == own) < 2 for own in level[bad])
 
 
 def _next_test(names: list[str], record: Record, cause: Cause) -> str:
