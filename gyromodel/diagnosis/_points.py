@@ -144,7 +144,7 @@ def robust_order(columns: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float]
     if comb(n, p) <= FITS:
         through = np.array(list(combinations(range(n), p)), int)
     else:
-        through = np.argsort(np.random.default_rng(0).random((FITS, n)), axis=1)[:, :p]
+        through = np.random.default_rng(0).integers(n, size=(FITS, p))
     sound = np.abs(np.linalg.det(u[through]))
     through = through[sound >= SOUND * sound.max()]
     misfit = np.abs(y - np.linalg.solve(u[through], y[through][..., None])[..., 0] @ u.T)
