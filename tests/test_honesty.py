@@ -293,6 +293,47 @@ def test_dwells_that_stand_apart_are_told_of(shift: float, said: bool, rng: np.r
     assert dwells_apart(gm.fit(walk.with_column("output", slow, "deg/s"), model), "deg/h") is None
 
 
+def rate_table(rng: np.random.Generator, bad: int, shift: float, visits: int, wave: float = 0.0) -> gm.Campaign:
+    """Thirty rates in random order at each visit, in noise of 1 deg/h; some dwells far apart shifted either way."""
+    rates = np.linspace(-60.0, 60.0, 30)
+    rate = np.repeat(np.concatenate([rng.permutation(rates) for _ in range(visits)]), 20)
+    off = np.zeros(len(rate) // 20)
+    off[3 + np.arange(bad) * (len(off) // max(bad, 1))] = shift * rng.choice([-1.0, 1.0], bad)
+    error = np.repeat(off, 20) + wave * np.sin(rate / 8.0) + rng.normal(size=len(rate))
+    return campaign(rate + error / 3600, np.arange(len(rate)) * 1.0, unit="deg/s", rate=rate)
+
+
+@pytest.mark.parametrize(("bad", "shift"), [(2, 6.0), (2, 60.0), (4, 20.0)])
+def test_anomalous_dwells_measured_once_are_points_or_a_curve(bad: int, shift: float) -> None:
+    drawn = rate_table(np.random.default_rng(bad), bad, shift, visits=1)
+    found = gm.diagnose(drawn, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
+    assert found.verdict == "ambiguous"
+    assert set(found.credible_set) == {"outliers", "scale_spline"}
+    places = ", ".join(str(20 * (3 + k * (30 // bad)) + 1) for k in range(bad))
+    assert any(f"{bad} whole dwells, which begin in data rows {places}:" in line for line in found.findings)
+    assert len(found.causes[0].parameters) == bad
+    assert all(p.std < 0.5 / 3600 and shift - 2 < abs(p.value) * 3600 < shift + 2 for p in found.causes[0].parameters)
+    assert found.next_test is not None
+    assert found.next_test.startswith("Repeat the points at")
+
+
+@pytest.mark.parametrize(("bad", "shift"), [(2, 20.0), (4, 6.0)])
+def test_anomalous_dwells_are_given_up_where_other_visits_are_good(bad: int, shift: float) -> None:
+    drawn = rate_table(np.random.default_rng(bad), bad, shift, visits=4)
+    found = gm.diagnose(drawn, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
+    assert found.verdict == "adequate"
+    assert any(line.startswith(f"{bad} whole dwells, which begin") for line in found.findings)
+
+
+def test_a_curve_visited_twice_is_no_set_of_dwells() -> None:
+    drawn = rate_table(np.random.default_rng(0), 0, 0.0, visits=2, wave=10.0)
+    found = gm.diagnose(drawn, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
+    assert "outliers" not in {c.effect for c in found.causes}
+    assert found.driver is not None
+    assert found.driver.column == "rate"
+    assert not any("whole dwell" in line for line in found.findings)
+
+
 def late_thermometer(
     rng: np.random.Generator, *, curve: float, lag: float, supply: float, rows: int = 240
 ) -> gm.Campaign:

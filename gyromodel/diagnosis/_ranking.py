@@ -157,6 +157,7 @@ def rank(
         contained,
         lines_of(estimate.model),
         list(continued.values()),
+        pulses,
     )
     results = {g: everything[g] for g in cells}
     prior = scanner.grid.log_prior

@@ -13,16 +13,16 @@ from copy import copy
 from dataclasses import dataclass, field
 from functools import cache
 
-import jax.numpy as jnp
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.special import gammaln
 from threadpoolctl import ThreadpoolController
 
 from gyromodel.diagnosis._bank import Bank
-from gyromodel.diagnosis._cells import Cell, Cells, precision
+from gyromodel.diagnosis._cells import Cell, Cells
 from gyromodel.diagnosis._evidence import log_evidence_ratio, log_mean, log_mean_of_parts
 from gyromodel.diagnosis._lines import PEAK_WIDTH, PEAKS, Line, line_grid
-from gyromodel.diagnosis._points import explained_by, robust_order
+from gyromodel.diagnosis._points import MOST_APART, MOST_POINTS, SUSPECT, levels, suspects, test_points
 from gyromodel.diagnosis._tangents import VANISHED, Tangent, add_tangents
 from gyromodel.noise import NoiseGrid
 from gyromodel.signals import Record
@@ -30,6 +30,8 @@ from gyromodel.signals import Record
 THREADS = 2
 # A form with less than this part of its energy in the rows kept was told by those left out.
 LOST = 1e-6
+# Of what giving up points explains, the part of a sum that is rounding.
+SINGULAR = 1e-10
 # Standard deviations below zero that a coefficient which cannot be negative may be found at.
 CLEARLY = 4.0
 # Lines whose interpolated statistic, were it this much larger, would not pay for the search are left interpolated.
@@ -37,8 +39,6 @@ PEAK_SLACK = 1.5
 # Further gross errors that are given up with the greatest: evidence of each alone (nats), the search over rows paid
 # for, and rows to the next, as errors side by side share theirs.
 ERROR_MARGIN, ERROR_DISTANCE = 8.0, 3
-# Records this short are test points, each of which may be anomalous; longer ones are series with single gross errors.
-TEST_POINTS = 40
 
 
 @cache
@@ -112,7 +112,8 @@ class Scanner:
         # With stated noise the first cell is the statement, and the rest are what it may lack.
         self.stated = stated
         self.only_cells = self.all_cells() if len(grid.log_prior) == 1 else None
-        self.by_points = int(self.present.sum()) <= TEST_POINTS
+        self.points = test_points(record) if outliers else []
+        self.by_points = len(self.points) == self.present.sum()
         self.cells = Cells(record.sampling, grid, bank, self.lines)
         # Blocks of one name together and, within it, of one structure.
         parts: dict[str, dict[str, list[int]]] = {}
@@ -141,10 +142,15 @@ class Scanner:
         other.present = np.asarray(other.record.sampling.present)
         whole, left = (np.sum(self.bank.columns[present] ** 2, axis=0) for present in (self.present, other.present))
         gone = np.add.reduceat((left < LOST * whole).astype(int), [b.start for b in self.bank.blocks])
+        other.points = [p for p in (p[other.present[p]] for p in self.points) if len(p)]
         other._lost = np.array([b.kind == "effect" for b in self.bank.blocks]) & (gone > 0)
         other.epochs, other._run_ends = epochs_of(other.record)
         other.cells, other.only_cells = self.cells.sampled(other.record.sampling), cells
         return other
+
+    def points_among(self, rows: Sequence[int]) -> list[np.ndarray]:
+        """The whole points among some rows; single gross errors of a series are none."""
+        return [p for p in self.points if np.isin(p, rows).all()]
 
     def all_cells(self) -> list[int]:
         """Every noise cell."""
@@ -192,6 +198,7 @@ class Scanner:
         contained: dict[str, int],
         lines: Sequence[Line] = (),
         tangents: Sequence[Tangent] = (),
+        given_up: Sequence[int] = (),
     ) -> dict[int, CellResult]:
         """Evaluate every candidate against a baseline in the given noise cells.
 
@@ -202,8 +209,9 @@ class Scanner:
             contained: how many of a candidate's columns the baseline already has, by name.
             lines: the baseline's.
             tangents: candidates that continue effects of the baseline.
+            given_up: rows that the last of the columns mark.
         """
-        batches = self.run_many(cells, jacobian, residual[:, None], contained, lines, tangents)
+        batches = self.run_many(cells, jacobian, residual[:, None], contained, lines, tangents, given_up)
         return {g: batch.first() for g, batch in zip(cells, batches, strict=True)}
 
     def run_many(
@@ -214,6 +222,7 @@ class Scanner:
         contained: dict[str, int],
         lines: Sequence[Line] = (),
         tangents: Sequence[Tangent] = (),
+        given_up: Sequence[int] = (),
     ) -> list[Batch]:
         """As `run`, for many residuals of one baseline at once (one a column); cells in the order given."""
         spare = np.array([contained.get(b.name, 0) for b in self.bank.blocks])
@@ -225,13 +234,20 @@ class Scanner:
         p, first = jacobian.shape[1], len(tangents)
         # What follows a line closely is a line that is not steady, and no other line.
         barred = self.lines.barred(lines) if self.lines else np.zeros(0, bool)
+        # Once: of what several sets leave, the rest of a curve would be the next.
+        points = [] if self.points_among(given_up) else self.points
+        most = int(len(points) * (MOST_POINTS if self.by_points else MOST_APART))
+        least_score = 0.0 if self.by_points else SUSPECT
+        orders = suspects(
+            points, levels(self.record, points), jacobian[:, : p - len(given_up)], residuals, most, least_score
+        )
 
         def search(group: Sequence[int]) -> list[Batch]:
             z, cross = self.cells.inner_products(group, stacked)
             batches = []
             for i, g in enumerate(group):
                 x, zi = stacked[:, first:], z[i][:, first:]
-                batches.append(batch := self._run_cell(g, x, zi, cross[i][:, first:], p, least, barred))
+                batches.append(batch := self._run_cell(g, x, zi, cross[i][:, first:], p, least, barred, points, orders))
                 add_tangents(batch, tangents, stacked, z[i], p, self.degrees_of_freedom - p)
             return batches
 
@@ -251,7 +267,16 @@ class Scanner:
         return int(self.present.sum())
 
     def _run_cell(
-        self, g: int, x: np.ndarray, z: np.ndarray, cross: np.ndarray, p: int, least: np.ndarray, barred: np.ndarray
+        self,
+        g: int,
+        x: np.ndarray,
+        z: np.ndarray,
+        cross: np.ndarray,
+        p: int,
+        least: np.ndarray,
+        barred: np.ndarray,
+        points: Sequence[np.ndarray],
+        orders: Sequence[np.ndarray],
     ) -> Batch:
         cell = self.cells[g]
         against = x[:, :p].T @ z
@@ -272,10 +297,10 @@ class Scanner:
             self._single(batch, "bias_step", self.epochs, sy, self.to_run_end(cell.step), sj, nu)
         if self.outliers:
             rows = np.flatnonzero(self.present[: self.record.rows])
-            if self.by_points:
-                self._test_points(batch, cell, zj[rows], zy[rows], rows, nu)
-            else:
+            if not self.by_points:
                 self._single(batch, "outliers", rows, zy[rows], cell.pulse[rows], zj[rows], nu)
+            if any(map(len, orders)):
+                self._whole(batch, g, points, orders, zj, zy, nu)
         if self.lines:
             self._lines(batch, g, zj, zy, nu, barred)
         return batch
@@ -335,25 +360,53 @@ class Scanner:
         if name == "outliers" and t.shape[1] == 1 and len(where):
             batch.best[name][0][0] = tuple(int(where[i]) for i in _gross(t[:, 0], where, batch.rss[0], nu))
 
-    def _test_points(self, batch: Batch, cell: Cell, zj: np.ndarray, zy: np.ndarray, rows: np.ndarray, nu: int) -> None:
-        """Sets of anomalous points, up to a third of all: in the order of a robust fit, priced by their number."""
-        identity = jnp.zeros((len(self.present), len(rows))).at[rows, np.arange(len(rows))].set(1.0)
-        left = np.asarray(precision(cell.filter, identity))[rows] - zj @ zj.T
-        sizes = np.arange(1, max(1, min(len(rows) // 3, nu - 1)) + 1)
-        price = gammaln(len(rows) + 1) - gammaln(sizes + 1) - gammaln(len(rows) - sizes + 1) + np.log(len(sizes))
-        evidence, sets, explained, dimension = [], [], [], []
-        for y, rss in zip(zy.T, batch.rss, strict=True):
-            order = robust_order(left, y)
-            t = np.array([explained_by(left, y, order[:m]) for m in sizes])
-            ratio = log_evidence_ratio(np.minimum(t, rss), rss, nu, sizes) - price
+    def _whole(
+        self,
+        batch: Batch,
+        g: int,
+        points: Sequence[np.ndarray],
+        orders: Sequence[np.ndarray],
+        zj: np.ndarray,
+        zy: np.ndarray,
+        nu: int,
+    ) -> None:
+        """Sets of anomalous points in a robust order, priced by their number; in a series beside single rows."""
+        among = np.unique(np.concatenate(orders))
+        marks = np.zeros((len(self.present), len(among)))
+        for column, k in zip(marks.T, among, strict=True):
+            column[points[k]] = 1.0
+        w, cross = self.cells.whiten(g, marks), marks.T @ zj
+        length = np.linalg.norm(w, axis=0)
+        left, y = (w.T @ w - cross @ cross.T) / np.outer(length, length), marks.T @ zy / length[:, None]
+        evidence, explained, dimension = np.full(len(orders), -np.inf), np.zeros(len(orders)), np.zeros(len(orders))
+        best: list[tuple[int, ...]] = [()] * len(orders)
+        for i, (order, rss) in enumerate(zip(orders, batch.rss, strict=True)):
+            sizes = np.arange(1, min(len(order), nu - 1) + 1)
+            if not len(sizes):
+                continue
+            price = (
+                gammaln(len(points) + 1) - gammaln(sizes + 1) - gammaln(len(points) - sizes + 1) + np.log(len(sizes))
+            )
+            chosen = np.searchsorted(among, order[: len(sizes)])
+            # What the first, the first two … explain.
+            root = np.linalg.cholesky(left[np.ix_(chosen, chosen)] + SINGULAR * np.eye(len(chosen)))
+            t = np.minimum(np.cumsum(solve_triangular(root, y[chosen, i], lower=True) ** 2), rss)
+            ratio = log_evidence_ratio(t, rss, nu, sizes) - price
             top = int(np.argmax(ratio))
-            evidence.append(float(np.logaddexp.reduce(ratio)))
-            sets.append(tuple(int(r) for r in rows[order[: top + 1]]))
-            explained.append(t[top])
-            dimension.append(top + 1.0)
-        batch.evidence["outliers"] = np.array(evidence)
-        batch.best["outliers"] = (sets, np.array(explained), np.array(dimension))
-        batch.energy["outliers"] = np.diag(left)
+            evidence[i], explained[i], dimension[i] = np.logaddexp.reduce(ratio), t[top], top + 1.0
+            best[i] = tuple(sorted(int(r) for k in order[: top + 1] for r in points[k]))
+        if self.by_points:
+            batch.evidence["outliers"], batch.best["outliers"] = evidence, (best, explained, dimension)
+            batch.energy["outliers"] = np.diag(left)
+            return
+        single, (rows, alone, one) = batch.evidence["outliers"], batch.best["outliers"]
+        whole = evidence > single
+        batch.evidence["outliers"] = np.logaddexp(single, evidence)
+        batch.best["outliers"] = (
+            [b if w else r for w, b, r in zip(whole, best, rows, strict=True)],
+            np.where(whole, explained, alone),
+            np.where(whole, dimension, one),
+        )
 
     def _lines(self, batch: Batch, g: int, zj: np.ndarray, zy: np.ndarray, nu: int, barred: np.ndarray) -> None:
         assert self.lines is not None

@@ -18,6 +18,7 @@ from gyromodel.diagnosis._epochs import epoch_interval
 from gyromodel.diagnosis._evidence import log_evidence_ratio
 from gyromodel.diagnosis._exchange import uncontested
 from gyromodel.diagnosis._lines import lines_of
+from gyromodel.diagnosis._points import levels
 from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, ease, is_driver, is_noise
 from gyromodel.diagnosis._result import Cause, Confuser, ParameterValue, Verdict
 from gyromodel.diagnosis._scan import Scanner
@@ -128,9 +129,15 @@ def judge(
     found = list(selection.found)
     causes, sets, findings = [], [], []
     given_up = sorted(row for step in found for row in step.points)
-    if given_up and not scanner.by_points:
-        what = f"{len(given_up)} gross errors" if len(given_up) > 1 else "A gross error"
-        findings.append(f"{what} {_places(given_up, searched)}: given up, not modelled.")
+    dwells = [] if scanner.by_points else scanner.points_among(given_up)
+    if dwells:
+        what = f"{len(dwells)} whole dwells, which begin" if len(dwells) > 1 else "A whole dwell, which begins"
+        findings.append(f"{what} {_places([int(d[0]) for d in dwells], searched)}: given up, not modelled.")
+    of_dwells = {int(row) for dwell in dwells for row in dwell}
+    errors = [] if scanner.by_points else [row for row in given_up if row not in of_dwells]
+    if errors:
+        what = f"{len(errors)} gross errors" if len(errors) > 1 else "A gross error"
+        findings.append(f"{what} {_places(errors, searched)}: given up, not modelled.")
     for one, other in zip(selection.path, selection.path[1:], strict=False):
         if one.paired and {one.name, other.name} <= {step.name for step in found}:
             findings.append(
@@ -167,8 +174,13 @@ def judge(
         # What was not added may stand in the place of this.
         members = credible(scanner, ranking, name, statistic, beside=beside - {selection.remains})
         if name == "outliers":
-            if scanner.by_points and _unrepeated(record, step.points):
-                members = {k: 0.5 * share for k, share in members.items()} | {"scale_spline": 0.5}
+            bad = np.array([np.isin(p, step.points).all() for p in scanner.points], bool)
+            in_a_row = not scanner.by_points and (bad[:-2] & bad[1:-1] & bad[2:]).any()
+            doubts = {"scale_spline": _unrepeated(scanner, bad), "bias_step": in_a_row and scanner.steps}
+            rivals = [k for k, possible in doubts.items() if possible]
+            if rivals:
+                own = {k: 0.5 * share for k, share in members.items()}
+                members = own | {k: 0.5 / len(rivals) + own.get(k, 0.0) for k in rivals}
             elif not scanner.by_points:
                 continue
         if isinstance(step.effect, BiasPeriodic) and _of_rounding(extended):
@@ -370,19 +382,18 @@ def _as_set(cause: Cause, members: dict[str, float]) -> tuple[Cause, ...]:
     return (cause, *others)
 
 
-def _unrepeated(record: Record, rows: tuple[int, ...]) -> bool:
-    """Whether some anomalous point's rate was measured only once, so that a curve through it cannot be excluded."""
-    if "rate" not in record.signals:
+def _unrepeated(scanner: Scanner, bad: np.ndarray) -> bool:
+    """Whether some anomalous point's rate has fewer than two good points, so that a curve through it is possible."""
+    if "rate" not in scanner.record.signals:
         return False
-    rate = np.asarray(record.signals["rate"])[: record.rows]
-    tolerance = 1e-3 * np.ptp(rate) + 1e-12
-    return any(np.sum(np.abs(rate - rate[r]) < tolerance) < 3 for r in rows)
+    level = levels(scanner.record, scanner.points)
+    return any(np.sum(level[~bad] == own) < 2 for own in level[bad])
 
 
 def _next_test(names: list[str], record: Record, cause: Cause) -> str:
     if "outliers" in names and cause.points and "rate" in record.signals:
         rate = np.asarray(record.signals["rate"])[list(cause.points)] * factor("rad/s", "deg/s")
-        levels = ", ".join(f"{r:.4g}" for r in sorted(rate))
+        levels = ", ".join(dict.fromkeys(f"{r:.4g}" for r in sorted(rate)))
         return (
             f"Repeat the points at {levels} deg/s several times, in both directions and in random order: anomalous "
             "test points do not come back, a curve does."
@@ -429,14 +440,14 @@ def _cause(
     _, explained, q = result.best[name]
     nu = scanner.degrees_of_freedom - ranking.baseline_columns.shape[1]
     p = float(stats.beta.sf(min(explained / result.rss, 1.0), q / 2, max(nu - q, 1) / 2))
-    shapes = comb(len(result.energy[name]), int(q)) if step.points else len(result.energy.get(name, ())) or 1
+    shapes = comb(len(scanner.points), int(q)) if step.points else len(result.energy.get(name, ())) or 1
     adjusted = float(min(1.0, p * shapes * trials))
     if len(null_scores):
         adjusted = float((1 + np.sum(null_scores >= statistic)) / (1 + len(null_scores)))
     rivals = sorted((k for k in ranking.statistic if k != name), key=lambda k: -ranking.statistic[k])[:4]
     confusers = tuple(Confuser(k, s) for k in rivals if (s := separation(scanner, ranking, name, k)) is not None)
     if step.points:
-        parameters = _point_parameters(scanner.record, estimate, step.points)
+        parameters = _point_parameters(scanner, estimate, step.points)
         if "scale_spline" in members:
             confusers = (Confuser("scale_spline", 0.0), *confusers)
     else:
@@ -475,18 +486,20 @@ def _dated(scanner: Scanner, estimate: Estimate, turn: int, g: int, parameter: P
     return replace(parameter, std=std * scale, ci95=(low * scale, high * scale))
 
 
-def _point_parameters(record: Record, estimate: Estimate, rows: tuple[int, ...]) -> tuple[ParameterValue, ...]:
+def _point_parameters(scanner: Scanner, estimate: Estimate, rows: tuple[int, ...]) -> tuple[ParameterValue, ...]:
+    record = scanner.record
     predicted = np.asarray(estimate.model.predict(record.signals))
     slope = np.asarray(estimate.model.slope(record.signals))
     jacobian = np.asarray(estimate.model.linearise(record.signals)[1])
     scale = factor("rad/s", "deg/s")
     found = []
-    for r in sorted(rows):
-        shift = (float(record.signals["output"][r]) - predicted[r]) / slope[r]
+    for p in scanner.points_among(rows):
+        shift = float(np.mean((np.asarray(record.signals["output"])[p] - predicted[p]) / slope[p]))
         # Of the point and of the model, which was fitted without it.
-        variance = estimate.white_variance + jacobian[r] @ estimate.covariance @ jacobian[r]
-        std = float(np.sqrt(variance)) / abs(slope[r])
-        rate = float(record.signals["rate"][r]) * scale if "rate" in record.signals else None
-        label = f"shift at {rate:.4g} deg/s" if rate is not None else f"shift at data row {r + 1}"
+        of_model = np.mean(jacobian[p], axis=0)
+        variance = estimate.white_variance / len(p) + of_model @ estimate.covariance @ of_model
+        std = float(np.sqrt(variance) / np.mean(np.abs(slope[p])))
+        rate = float(record.signals["rate"][p[0]]) * scale if "rate" in record.signals else None
+        label = f"shift at {rate:.4g} deg/s" if rate is not None else f"shift at data row {p[0] + 1}"
         found.append(ParameterValue(label, shift * scale, std * scale, "deg/s"))
     return tuple(found)
