@@ -23,7 +23,6 @@ from gyromodel.platform import (
     FREQUENCIES,
     BaseMotion,
     Explanation,
-    Points,
     VibrationTest,
     explain,
     fit_sines,
@@ -34,7 +33,7 @@ from gyromodel.platform import (
     responses,
     vibration_test,
 )
-from gyromodel.platform._assessment import _explained
+from gyromodel.platform._judgement import _explained
 from gyromodel.report import vibration_words, with_uncertainty
 
 LOG = Path(gyromodel.__file__).parent / "data" / "platform_vibration.csv.gz"
@@ -130,7 +129,9 @@ def test_the_embedded_log(demo: VibrationTest):
     assert not demo.remarks
     assert all(r.verdicts[0] == "pass" for r in demo.responses)
     best = demo.supported[0]
-    assert best == "time offset, wet and dry friction, integration estimated"
+    assert best == "time offset, wet and dry friction, integration estimated, without axis Y"
+    assert demo.left_out == ("Y",)
+    assert demo.supported == (best,)
     values = {row.name: row.value for row in parameters(demo.explanations[best])}
     assert values["time offset"] == pytest.approx(2.0, abs=0.02)
     assert values["friction over inertia X"] == pytest.approx(0.5 / 0.45 * 210 / 220, rel=0.25)
@@ -171,8 +172,7 @@ def explained(rng: np.random.Generator, passed: Callable[[float], complex]) -> d
         wave = np.exp(1j * w * np.arange(SAMPLES) * STEP)
         draws.append([AMPLITUDE * x.imag + SECOND * rng.standard_normal(SAMPLES) for x in (passed(w) * wave, wave)])
     found, _ = responses(motion(*(np.stack(x) for x in zip(*draws, strict=True))))
-    at = Points(np.zeros(3, int), np.array(frequencies), np.ones(3), np.zeros(3), np.full(3, AMPLITUDE))
-    return _explained(at, found, known=True)
+    return _explained(found, integrated=False)
 
 
 def test_an_isolator_is_no_time_offset(rng: np.random.Generator):
@@ -229,7 +229,7 @@ def test_one_axis_at_two_frequencies_tells_less():
 def test_known_standard_errors(rng: np.random.Generator):
     """Sums of squares follow χ², and intervals of parameters hold."""
     alternative, at = ALTERNATIVES["time offset, friction"], points(FREQUENCIES)
-    value = np.zeros(14)
+    value = np.zeros(15)
     value[:6] = [1.5e-3] * 3 + [2.0, 3.0, 4.0]
     exact = predicted(Explanation(alternative, value, value, np.ones(2), np.zeros(24), 0.0), at)
     std, draws = np.array([np.full(12, 2e-3), np.full(12, 2e-2)]), 60
