@@ -25,6 +25,8 @@ from gyromodel.platform._series import fit_series
 
 # Standard deviations between predictions with which 5 % of repetitions at most prefer the wrong one.
 TOLD_APART, USELESS = 3.3, 0.05
+# Standard uncertainties that a crossover which the runs determine is worth.
+DETERMINED = 5.0
 # What tells more where runs are too few.
 MORE = "more frequencies about each axis"
 # Periods of a run that its history has at least, where there is one, and shows at most.
@@ -217,13 +219,13 @@ def vibration_test(campaign: Campaign, progress: Callable[[str, float], None] | 
 
 
 def _crossover(best: Explanation, found: list[Response], integrated: bool, known: bool) -> Row | None:
-    """The crossover fitted beside the rest of an explanation, where it is twice its standard uncertainty."""
+    """The crossover fitted beside the rest of an explanation, where the runs determine it."""
     alternative = best.alternative
     if "crossover" not in alternative.kinds:
         alternative = Alternative((*alternative.kinds, "crossover"), alternative.loop, alternative.grounded)
     with suppress(EstimateError):
-        row = parameters(explained(alternative, found, integrated, best.left_out, known))[-1]
-        return row if row.name == "crossover" and row.value > 2 * row.std else None
+        row = parameters(explained(alternative, found, integrated, best.left_out, known, [best]))[-1]
+        return row if row.name == "crossover" and row.value > DETERMINED * row.std else None
     return None
 
 

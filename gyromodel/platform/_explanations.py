@@ -20,7 +20,7 @@ from scipy.stats import chi2
 from gyromodel.estimate import EstimateError
 from gyromodel.numerics.least_squares import levenberg_marquardt
 from gyromodel.platform._acceptance import AXES
-from gyromodel.platform._alternatives import SIZES, Alternative
+from gyromodel.platform._alternatives import ENTRIES, SIZES, Alternative
 from gyromodel.platform._loop import Loop, Mount, measured_response
 
 # Amplitude of the published test, rad.
@@ -31,6 +31,9 @@ ROUNDS, SETTLED = 200, 1e-9
 SINGULAR = 1e-9
 # A standard uncertainty this many times the larger of a parameter's value and its start is no estimate.
 RUNAWAY = 100.0
+# The first entry of the loop, whose shape stays the usual one where fits begin near another, and what of their sizes
+# others begin with there.
+LOOP, SMALL = ENTRIES.index("corner"), 0.2
 # Points of one compiled program are a multiple of this.
 BUCKET = 16
 
@@ -104,6 +107,7 @@ def explain(
     signed: bool = True,
     phase_std: Float[np.ndarray, " point"] | None = None,
     gain_std: Float[np.ndarray, " point"] | None = None,
+    start: Float[np.ndarray, " entry"] | None = None,
 ) -> Explanation:
     """Fit an alternative to gains and phases.
 
@@ -120,6 +124,7 @@ def explain(
         signed: whether the phases have a sign; those of an arccos do not, nor has then the offset.
         phase_std: standard deviations of the phases, deg; without `gain_std`, relative to each other, equal by default.
         gain_std: of the gains, dB; both are then taken for known.
+        start: entries that the fit begins at.
 
     Raises:
         EstimateError: the points do not determine the alternative.
@@ -128,7 +133,7 @@ def explain(
     std = np.concatenate([np.ones(n) if x is None else x for x in (gain_std, phase_std)])
     measured, groups = np.concatenate([gain, phase]), None if known else np.repeat([0, 1], n)
     columns = tested(alternative, at)
-    found = physical(columns, _linearise(alternative, at, signed), measured, std, groups)
+    found = physical(columns, _linearise(alternative, at, signed), measured, std, groups, start)
     squares = np.mean((found.residual / std).reshape(2, n) ** 2, axis=1)
     k = columns.shape[1] + 2 * (not known)
     corrected = 2 * k * (k + 1) / (2 * n - k - 1) if 2 * n > k + 1 else np.inf
@@ -136,6 +141,12 @@ def explain(
     scatter = np.sqrt(np.mean(std.reshape(2, n) ** 2, axis=1)) if known else found.scatter
     total, free = found.sum_of_squares, 2 * n - k
     return Explanation(alternative, found.value, found.std, scatter, found.residual, cost + 2 * k, total, free)
+
+
+def beginning(found: Explanation) -> Float[np.ndarray, " entry"]:
+    """Entries near an explanation, at which the fit of one that has more may begin: what it lacks is small there."""
+    small = np.where(np.arange(len(ENTRIES)) < LOOP, SMALL, 1.0) * SIZES
+    return np.where(found.value != 0, found.value, small)
 
 
 def predicted(found: Explanation, at: Points) -> Float[np.ndarray, "2 point"]:
@@ -170,8 +181,11 @@ def separation(
     exact = np.asarray(_predicted(jnp.asarray(truth.value), _data(truth.alternative, at, sign)))
     std = np.repeat(truth.scatter, n)
     # Of one unknown factor, which does not change the fit: no test of whether its size is probable.
-    found = physical(tested(rival, at), _linearise(rival, at, sign), exact, std, np.zeros(2 * n, int))
-    return float(np.linalg.norm(found.residual / std))
+    found = [
+        physical(tested(rival, at), _linearise(rival, at, sign), exact, std, np.zeros(2 * n, int), start)
+        for start in (SIZES, beginning(truth))
+    ]
+    return min(float(np.linalg.norm(fit.residual / std)) for fit in found)
 
 
 class _Data(NamedTuple):

@@ -17,7 +17,7 @@ import numpy as np
 from gyromodel.estimate import EstimateError
 from gyromodel.platform._acceptance import AXES
 from gyromodel.platform._alternatives import ENTRIES, OFFERED, Alternative
-from gyromodel.platform._explanations import Explanation, Points, assumed_loop, explain, points, separation
+from gyromodel.platform._explanations import Explanation, Points, assumed_loop, beginning, explain, points, separation
 from gyromodel.platform._responses import Response
 
 # Entries by kind.
@@ -107,7 +107,7 @@ def under(found: list[Response], integrated: bool) -> Points:
 
 def explained(
     alternative: Alternative, found: list[Response], integrated: bool, left_out: tuple[str, ...] = (),
-    known: bool = True,
+    known: bool = True, smaller: Iterable[Explanation] = (),
 ) -> Explanation:  # fmt: skip
     """An alternative fitted to responses, but for those of some axes.
 
@@ -117,6 +117,8 @@ def explained(
         integrated: whether navigation integrated the rates of the platform.
         left_out: axes whose numbers each cost a parameter instead.
         known: whether the standard errors of the responses are taken for known.
+        smaller: explanations within it, at the best of which the fit begins once more: from afar it may end in a
+            place that has more friction, or less than none.
 
     Raises:
         EstimateError: they do not determine it.
@@ -127,18 +129,29 @@ def explained(
     loose = np.sqrt([r.degrees_of_freedom / (r.degrees_of_freedom - 2) for r in used])
     stds = [loose * np.array([getattr(r, name) for r in used]) for name in ("gain_std", "phase_std")]
     gain_std, phase_std = stds if known and np.min(stds) > 0 else (None, None)
-    fit = explain(alternative, under(used, integrated), gain, phase, phase_std=phase_std, gain_std=gain_std)
+    near = min(smaller, key=lambda e: e.criterion, default=None)
+    fits = []
+    for start in (None, *([beginning(near)] if near else [])):
+        with suppress(EstimateError):
+            at = under(used, integrated)
+            fits.append(explain(alternative, at, gain, phase, True, phase_std, gain_std, start))
+    if not fits:
+        raise EstimateError("the points of the vibration test do not determine this explanation")
+    fit = min(fits, key=lambda e: e.criterion)
     return replace(fit, criterion=fit.criterion + 4 * (len(found) - len(used)), left_out=left_out)
 
 
 def _explained(
     found: list[Response], integrated: bool, left_out: tuple[str, ...] = (), known: bool = True
 ) -> dict[str, Explanation]:
-    explanations = {}
-    for name, alternative in OFFERED.items():
+    explanations: dict[str, Explanation] = {}
+    for name, alternative in sorted(OFFERED.items(), key=lambda item: len(item[1].kinds)):
+        smaller = [e for e in explanations.values() if e.alternative.within(alternative)]
         with suppress(EstimateError):  # too few points for it
-            explanations[name] = explained(alternative, found, integrated, left_out, known)
-    return {name: e for name, e in explanations.items() if e.degrees_of_freedom > 0 and _plausible(e)}
+            e = explained(alternative, found, integrated, left_out, known, smaller)
+            if e.degrees_of_freedom > 0 and _plausible(e):
+                explanations[name] = e
+    return explanations
 
 
 def further(possible: list[Explanation], found: list[Response], integrated: bool) -> dict[str, float]:

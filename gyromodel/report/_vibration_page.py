@@ -57,7 +57,7 @@ def vibration_page(test: VibrationTest, figures: Mapping[str, str], campaign: st
             "notes": notes(test),
             "rows": _rows(test),
             "lines": [line for line in (lines if further else [*lines, last]) if not line.startswith("- ")],
-            "next_test": last if further else None,
+            "next_test": last.removeprefix("Next test: ").capitalize() if test.few else (last if further else None),
             "findings": test.remarks,
             "figures": figures,
             "captions": _CAPTIONS,
