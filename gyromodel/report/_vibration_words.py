@@ -64,7 +64,7 @@ def vibration_sentence(test: VibrationTest) -> str:
         return f"{limits}; they are too few to name what explains them."
     if len(test.supported) > 1:
         return f"{limits}; {len(test.supported)} explanations of them cannot be told apart."
-    name = test.supported[0]
+    name = test.possible[0]
     rows = parameters(test.explanations[name])[:1]
     first = "".join(f" ({row.name} {with_uncertainty(row.value, row.std, row.unit)})" for row in rows)
     return f"{limits}; what explains them is {name}{first}."
