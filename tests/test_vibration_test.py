@@ -211,9 +211,8 @@ def test_an_isolator_is_no_time_offset(rng: np.random.Generator):
         return (1 + 2 * damping * s) / (1 + 2 * damping * s + s**2)
 
     explanations = explained(rng, isolator)
-    assert min(explanations, key=lambda name: explanations[name].criterion).startswith(
-        ("resonance, d", "time offset, r")
-    )
+    likely = [name for name, e in explanations.items() if e.probability > 1e-6]
+    assert all("resonance" in name or "loop estimated" in name for name in likely)
     right = explanations["resonance, damped"]
     assert right.probability > 1e-6
     assert explanations["time offset, resonance"].probability < 1e-6
