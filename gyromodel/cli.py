@@ -447,7 +447,7 @@ def vibration(
 ) -> None:
     """Amplitude and phase of a gyro-stabilised platform on an angular vibration table, and what explains them."""
     from gyromodel.platform import vibration_test
-    from gyromodel.report import vibration_figures, vibration_words
+    from gyromodel.report import vibration_figures, vibration_page, vibration_words
 
     [measured] = read_campaigns([campaign], None)
     with progress_bar() as progress:
@@ -457,13 +457,14 @@ def vibration(
     write_text(output / "vibration.json", json_text(result))
     for name, figure in figures.items():
         write_text(output / f"{name}.svg", figure)
+    write_text(output / "report.html", vibration_page(test, figures, measured.name))
     if as_json:
         print(json_text(result), end="")
         return
     words = vibration_words(test)
     print_table(words.head, words.runs)
     print("".join(f"\n{line}" for line in words.lines))
-    print_paths(output, "vibration.json", *(f"{name}.svg" for name in figures))
+    print_paths(output, "report.html", "vibration.json", *(f"{name}.svg" for name in figures))
 
 
 @app.command()

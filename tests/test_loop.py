@@ -200,7 +200,7 @@ def test_causes_are_found_again(rng: np.random.Generator):
     gain = 20 * np.log10(np.abs(response)) + 1e-3 * rng.standard_normal(12)
     phase = np.rad2deg(np.angle(response)) + 1e-2 * rng.standard_normal(12)
     found = explain(alternative, at, gain, phase)
-    expected = np.array([1.5e-3] * 3 + [2, 4, 6] + [0] * 3 + [1 / n**2 for _, n in axes] + [lag, 0])
+    expected = np.array([1.5e-3] * 3 + [2, 4, 6] + [0] * 3 + [1 / n**2 for _, n in axes] + [lag, 0, 0])
     assert (np.abs(found.value - expected) <= 10 * found.std + 1e-4 * expected).all(), found
     assert (found.std <= 0.4 * expected).all()
     assert explain(ALTERNATIVES["time offset"], at, gain, phase).criterion > found.criterion + 20
@@ -210,13 +210,13 @@ def test_what_a_further_test_separates():
     """Resonance and a time offset against an offset of each axis: the gain is all that these miss, in closed form, and
     root two times that in a repetition; one offset is three."""
     at, compliance, scatter = points(FREQUENCIES), np.array([1e-5, 2e-5, 0.0]), np.array([0.03, 0.7])
-    value = np.concatenate([np.full(3, 2e-3), np.zeros(6), compliance, [0.0, 0.0]])
-    resonant = Explanation(ALTERNATIVES["time offset, resonance"], value, np.zeros(14), scatter, np.zeros(24), 0.0)
+    value = np.concatenate([np.full(3, 2e-3), np.zeros(6), compliance, [0.0, 0.0, 0.0]])
+    resonant = Explanation(ALTERNATIVES["time offset, resonance"], value, np.zeros(15), scatter, np.zeros(24), 0.0)
     expected = np.linalg.norm(20 * np.log10(1 - np.outer(compliance, FREQUENCIES**2))) / scatter[0]
     rival = ALTERNATIVES["time offset of each axis"]
     assert separation(resonant, rival, at, at) == pytest.approx(np.sqrt(2) * expected, rel=1e-6)
-    value = np.where(np.arange(14) < 3, 2e-3, 0.0)
-    late = Explanation(ALTERNATIVES["time offset, resonance"], value, np.zeros(14), scatter, np.zeros(24), 0.0)
+    value = np.where(np.arange(15) < 3, 2e-3, 0.0)
+    late = Explanation(ALTERNATIVES["time offset, resonance"], value, np.zeros(15), scatter, np.zeros(24), 0.0)
     assert separation(late, rival, at, at) < 1e-6
     # What navigation sees of the body is no longer missed: friction then leaves next to nothing.
     pulled = eqx.tree_at(lambda x: x.friction, Loop(), jnp.array(5.0))

@@ -10,15 +10,14 @@ from gyromodel.platform._acceptance import (
     judge_phase,
     limits_at,
 )
-from gyromodel.platform._assessment import EXCLUDED, VibrationTest, parameters, vibration_test
+from gyromodel.platform._alternatives import ALTERNATIVES, ENTRIES, OFFERED, Alternative
+from gyromodel.platform._assessment import VibrationTest, parameters, vibration_test
 from gyromodel.platform._bench import Bench, base_on_table, simulate_vibration_test
 from gyromodel.platform._campaign import navigate_campaign
 from gyromodel.platform._drift import residual_drift
 from gyromodel.platform._earth import EARTH_RATE, earth_rate, gravity, radii, transport_rate
 from gyromodel.platform._errors import Errors, NavigationError, drift_errors, navigation_error, pushes_at_rest
 from gyromodel.platform._explanations import (
-    ALTERNATIVES,
-    Alternative,
     Explanation,
     Points,
     assumed_loop,
@@ -37,6 +36,7 @@ from gyromodel.platform._gimbals import (
     nulled_gimbals,
 )
 from gyromodel.platform._increments import coning, integrals, sculling
+from gyromodel.platform._judgement import EXCLUDED
 from gyromodel.platform._loop import Loop, Margins, Mount, margins, measured_response
 from gyromodel.platform._motion import GIMBALS, TABLE, BaseMotion, base_motion, is_platform
 from gyromodel.platform._navigation import Navigation, attitudes, navigate
@@ -50,10 +50,12 @@ from gyromodel.platform._vibration import PublishedResponse, SineFit, fit_sines,
 __all__ = [
     "ALTERNATIVES",
     "EARTH_RATE",
+    "ENTRIES",
     "EXCLUDED",
     "FREQUENCIES",
     "GAIN_LIMIT",
     "GIMBALS",
+    "OFFERED",
     "PHASE_LIMIT",
     "PRINTED_GAIN",
     "PRINTED_PHASE",

@@ -6,10 +6,8 @@ A time offset between the records, viscous friction through the loop and a reson
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,17 +20,9 @@ from scipy.stats import chi2
 from gyromodel.estimate import EstimateError
 from gyromodel.numerics.least_squares import levenberg_marquardt
 from gyromodel.platform._acceptance import AXES
+from gyromodel.platform._alternatives import ENTRIES, SIZES, Alternative
 from gyromodel.platform._loop import Loop, Mount, measured_response
 
-# What the causes are made of: time offset (s), friction (N m s/rad), dry friction (N m) and compliance (s²) of each
-# axis, lag (s) of all, and the corner of the loop's integration (rad/s).
-ENTRIES = (
-    *(f"{kind} {axis}" for kind in ("offset", "friction", "dry friction", "compliance") for axis in AXES),
-    "lag",
-    "corner",
-)
-# Where fits begin; all but offsets are positive.
-SIZES = np.repeat([1e-3, 1.0, 1e-2, 1e-5, 1e-3, 40.0], [3, 3, 3, 3, 1, 1])
 # Amplitude of the published test, rad.
 AMPLITUDE = np.deg2rad(0.15)
 # Rounds of a fit and of the scatter that it leaves, and the relative change that ends them.
@@ -41,64 +31,13 @@ ROUNDS, SETTLED = 200, 1e-9
 SINGULAR = 1e-9
 # A standard uncertainty this many times the larger of a parameter's value and its start is no estimate.
 RUNAWAY = 100.0
-# Loops of the published bandwidth other than the default one: with as much integration as margins of 45° allow, and
-# with two integrators.
-QUICK = {"correction": 5.0, "corner": 120.0}
-DOUBLE = {"correction": 5.5, "corner": 48.0, "second_corner": 48.0}
-
+# The first entry of the loop, whose shape stays the usual one where fits begin near another, and what of their sizes
+# others begin with there.
+LOOP, SMALL = ENTRIES.index("corner"), 0.2
+# Points of one compiled program are a multiple of this.
+BUCKET = 16
 
 Linearise = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-
-
-class Alternative(NamedTuple):
-    """An explanation: which kinds of entries it has, in which loop, and what the mount's damper acts against.
-
-    kinds: of "offset" (the same for all axes), "offsets" (of each axis), "friction", "dry friction", "compliance",
-    "lag" and "corner" (of the integration, of all loops); loop: what of it differs from the default one.
-    """
-
-    kinds: tuple[str, ...]
-    loop: Mapping[str, Any] = MappingProxyType({})
-    grounded: float = 0.0
-
-    @property
-    def columns(self) -> Float[np.ndarray, "entry parameter"]:
-        """Entries by parameters."""
-        unit = np.eye(len(ENTRIES))
-        parts = {
-            "offset": unit[:, :3].sum(1, keepdims=True),
-            "offsets": unit[:, :3],
-            "friction": unit[:, 3:6],
-            "dry friction": unit[:, 6:9],
-            "compliance": unit[:, 9:12],
-            "lag": unit[:, 12:13],
-            "corner": unit[:, 13:],
-        }
-        return np.concatenate([parts[kind] for kind in self.kinds], axis=1)
-
-
-ALTERNATIVES = {
-    "time offset": Alternative(("offset",)),
-    "time offset of each axis": Alternative(("offsets",)),
-    "friction": Alternative(("friction",)),
-    "friction, quick integration": Alternative(("friction",), QUICK),
-    "friction, double integration": Alternative(("friction",), DOUBLE),
-    "resonance": Alternative(("compliance",)),
-    "resonance, damped": Alternative(("compliance", "lag")),
-    "resonance, damped against inertial space": Alternative(("compliance", "lag"), grounded=1.0),
-    "time offset, resonance": Alternative(("offset", "compliance")),
-    "time offset, resonance, damped": Alternative(("offset", "compliance", "lag")),
-    "time offset, friction": Alternative(("offset", "friction")),
-    "time offset, friction, double integration": Alternative(("offset", "friction"), DOUBLE),
-    "friction, resonance": Alternative(("friction", "compliance")),
-    "friction, resonance, quick integration": Alternative(("friction", "compliance"), QUICK),
-    "time offset, friction, resonance": Alternative(("offset", "friction", "compliance")),
-    "friction, integration estimated": Alternative(("friction", "corner")),
-    "time offset, friction, integration estimated": Alternative(("offset", "friction", "corner")),
-    "time offset, wet and dry friction, integration estimated": Alternative(
-        ("offset", "friction", "dry friction", "corner")
-    ),
-}
 
 
 class Points(NamedTuple):
@@ -141,6 +80,7 @@ class Explanation:
             difference of 2 is little.
         sum_of_squares: of residuals over their standard deviations.
         degrees_of_freedom: observations less parameters, those held at zero and scatters included.
+        left_out: axes whose runs it leaves unexplained, at the price of a parameter each number.
     """
 
     alternative: Alternative
@@ -151,6 +91,7 @@ class Explanation:
     criterion: float
     sum_of_squares: float = np.nan
     degrees_of_freedom: int = 0
+    left_out: tuple[str, ...] = ()
 
     @property
     def probability(self) -> float:
@@ -166,6 +107,7 @@ def explain(
     signed: bool = True,
     phase_std: Float[np.ndarray, " point"] | None = None,
     gain_std: Float[np.ndarray, " point"] | None = None,
+    start: Float[np.ndarray, " entry"] | None = None,
 ) -> Explanation:
     """Fit an alternative to gains and phases.
 
@@ -182,6 +124,7 @@ def explain(
         signed: whether the phases have a sign; those of an arccos do not, nor has then the offset.
         phase_std: standard deviations of the phases, deg; without `gain_std`, relative to each other, equal by default.
         gain_std: of the gains, dB; both are then taken for known.
+        start: entries that the fit begins at.
 
     Raises:
         EstimateError: the points do not determine the alternative.
@@ -190,7 +133,7 @@ def explain(
     std = np.concatenate([np.ones(n) if x is None else x for x in (gain_std, phase_std)])
     measured, groups = np.concatenate([gain, phase]), None if known else np.repeat([0, 1], n)
     columns = tested(alternative, at)
-    found = physical(columns, partial(_linearise, _data(alternative, at, signed)), measured, std, groups)
+    found = physical(columns, _linearise(alternative, at, signed), measured, std, groups, start)
     squares = np.mean((found.residual / std).reshape(2, n) ** 2, axis=1)
     k = columns.shape[1] + 2 * (not known)
     corrected = 2 * k * (k + 1) / (2 * n - k - 1) if 2 * n > k + 1 else np.inf
@@ -200,6 +143,12 @@ def explain(
     return Explanation(alternative, found.value, found.std, scatter, found.residual, cost + 2 * k, total, free)
 
 
+def beginning(found: Explanation) -> Float[np.ndarray, " entry"]:
+    """Entries near an explanation, at which the fit of one that has more may begin: what it lacks is small there."""
+    small = np.where(np.arange(len(ENTRIES)) < LOOP, SMALL, 1.0) * SIZES
+    return np.where(found.value != 0, found.value, small)
+
+
 def predicted(found: Explanation, at: Points) -> Float[np.ndarray, "2 point"]:
     """Gains (dB) and signed phases (deg) that a fitted explanation has at some points."""
     entries, data = jnp.asarray(found.value), _data(found.alternative, at, True)
@@ -207,9 +156,9 @@ def predicted(found: Explanation, at: Points) -> Float[np.ndarray, "2 point"]:
 
 
 def assumed_loop(found: Explanation) -> Loop:
-    """The loop of an explanation, with the corner of its integration where that was fitted."""
-    loop, corner = Loop(**found.alternative.loop), found.value[ENTRIES.index("corner")]
-    return eqx.tree_at(lambda x: x.corner, loop, jnp.asarray(corner)) if corner > 0 else loop
+    """The loop of an explanation, with the corner of its integration and the crossover where those were fitted."""
+    estimated = jnp.asarray([kind in found.alternative.kinds for kind in ("corner", "crossover")], float)
+    return _loop(jnp.asarray(found.value), Loop(**found.alternative.loop), estimated)
 
 
 def separation(
@@ -232,9 +181,11 @@ def separation(
     exact = np.asarray(_predicted(jnp.asarray(truth.value), _data(truth.alternative, at, sign)))
     std = np.repeat(truth.scatter, n)
     # Of one unknown factor, which does not change the fit: no test of whether its size is probable.
-    linearise = partial(_linearise, _data(rival, at, sign))
-    found = physical(tested(rival, at), linearise, exact, std, np.zeros(2 * n, int))
-    return float(np.linalg.norm(found.residual / std))
+    found = [
+        physical(tested(rival, at), _linearise(rival, at, sign), exact, std, np.zeros(2 * n, int), start)
+        for start in (SIZES, beginning(truth))
+    ]
+    return min(float(np.linalg.norm(fit.residual / std)) for fit in found)
 
 
 class _Data(NamedTuple):
@@ -244,21 +195,37 @@ class _Data(NamedTuple):
     signed: Float[Array, " point"]
     loop: Loop
     grounded: Float[Array, ""]
-    integrating: Float[Array, ""]
+    estimated: Float[Array, " 2"]
 
 
 def _data(alternative: Alternative, at: Points, signed: bool | np.ndarray) -> _Data:
     sign = np.broadcast_to(np.asarray(signed, float), at.frequency.shape)
-    integrating = float("corner" in alternative.kinds)
-    at, arrays = jax.tree.map(jnp.asarray, (at, (sign, alternative.grounded, integrating)))
-    return _Data(at, arrays[0], Loop(**alternative.loop), *arrays[1:])
+    at, sign = jax.tree.map(jnp.asarray, (at, sign))
+    return _Data(at, sign, *shape(alternative))
+
+
+def shape(alternative: Alternative) -> tuple[Loop, Array, Array]:
+    """Its loop, what its damper acts against, and whether corner and crossover are fitted, as `_Data` has them."""
+    estimated = [float(kind in alternative.kinds) for kind in ("corner", "crossover")]
+    return Loop(**alternative.loop), jnp.asarray(alternative.grounded), jnp.asarray(estimated)
+
+
+@jax.jit
+def _loop(entry: Array, loop: Loop, estimated: Array) -> Loop:
+    """A loop with the corner and the crossover of the entries, as far as these are estimated."""
+    corner = jnp.where(estimated[0] > 0, entry[13], loop.corner)
+    loop = eqx.tree_at(lambda x: x.corner, loop, corner)
+    # |L| = 1 at the crossover, there being no friction: K_0 = J ω/|W_c W_m G_fog|.
+    crossover = jnp.where(estimated[1] > 0, entry[14], 1.0)
+    amplifier = loop.amplifier / jnp.abs(loop.open_loop(crossover[None])[0])
+    return eqx.tree_at(lambda x: x.amplifier, loop, jnp.where(estimated[1] > 0, amplifier, loop.amplifier))
 
 
 def loop_and_mount(entry: Array, data: Any, axis: Array, amplifier: Array, dry: Array) -> tuple[Loop, Mount]:
     """Those of an axis by all entries, `dry` added to the friction; data: of `_Data` the last three."""
-    corner = jnp.where(data.integrating > 0, entry[13], data.loop.corner)
-    changed = entry[3:6][axis] + dry, amplifier * data.loop.amplifier, corner
-    loop = eqx.tree_at(lambda x: (x.friction, x.amplifier, x.corner), data.loop, changed)
+    loop = _loop(entry, data.loop, data.estimated)
+    changed = entry[3:6][axis] + dry, amplifier * loop.amplifier
+    loop = eqx.tree_at(lambda x: (x.friction, x.amplifier), loop, changed)
     return loop, Mount(entry[:3][axis], entry[9:12][axis], entry[12], data.grounded)
 
 
@@ -286,14 +253,26 @@ def _linearised(entry: Array, data: _Data) -> tuple[Array, Array]:
     return _predict(entry, data), jax.jacfwd(_predict)(entry, data)
 
 
-def _linearise(data: _Data, entry: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    value, jacobian = _linearised(jnp.asarray(entry), data)
-    return np.asarray(value), np.asarray(jacobian)
+def _linearise(alternative: Alternative, at: Points, signed: bool | np.ndarray) -> Linearise:
+    """Predictions at some points and their derivatives."""
+    n = len(at.axis)
+    # Of a number of points that recurs: a new one takes seconds to compile.
+    fill = (0, -n % BUCKET)
+    at = Points(*(np.pad(x, fill, mode="edge") for x in at))
+    sign = np.pad(np.broadcast_to(np.asarray(signed, float), n), fill)
+    data = _data(alternative, at, sign)
+    kept = np.concatenate([np.arange(n), len(sign) + np.arange(n)])
+
+    def linearise(entry: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        value, jacobian = (np.asarray(x) for x in _linearised(entry, data))
+        return value[kept], jacobian[kept]
+
+    return linearise
 
 
 def tested(alternative: Alternative, at: Any) -> np.ndarray:
     """The columns that axes of the test (`at.axis`) have a part in."""
-    seen = np.concatenate([np.tile(np.isin(range(len(AXES)), at.axis), 4), [True, True]])
+    seen = np.concatenate([np.tile(np.isin(range(len(AXES)), at.axis), 4), [True, True, True]])
     columns = alternative.columns
     return columns[:, columns[seen].any(axis=0)]
 
@@ -309,8 +288,9 @@ class Fit(NamedTuple):
 
 
 def physical(
-    columns: np.ndarray, linearise: Linearise, measured: np.ndarray, std: np.ndarray, groups: np.ndarray | None = None
-) -> Fit:
+    columns: np.ndarray, linearise: Linearise, measured: np.ndarray, std: np.ndarray, groups: np.ndarray | None = None,
+    start: np.ndarray | None = None,
+) -> Fit:  # fmt: skip
     """The least-squares fit in which no entry but an offset is negative.
 
     Args:
@@ -319,12 +299,13 @@ def physical(
         measured: what is predicted.
         std: its standard deviations.
         groups: of observations whose standard deviations have a common unknown factor; without, they are known.
+        start: entries that the fit begins at.
 
     Raises:
         EstimateError: the observations do not determine the parameters.
     """
     while True:
-        found = _fitted(columns, linearise, measured, std, groups)
+        found = _fitted(columns, linearise, measured, std, groups, SIZES if start is None else start)
         size = columns.T @ SIZES
         relative = np.where(columns[:3].any(0), np.inf, columns.T @ found.value / size)
         if relative.min(initial=np.inf) >= 0:
@@ -333,8 +314,9 @@ def physical(
 
 
 def _fitted(
-    columns: np.ndarray, linearise: Linearise, measured: np.ndarray, std: np.ndarray, groups: np.ndarray | None
-) -> Fit:
+    columns: np.ndarray, linearise: Linearise, measured: np.ndarray, std: np.ndarray, groups: np.ndarray | None,
+    start: np.ndarray,
+) -> Fit:  # fmt: skip
     known = groups is None
     groups = np.zeros(len(measured), int) if groups is None else groups
     counts = columns.sum(0)
@@ -348,16 +330,18 @@ def _fitted(
         residual, jacobian = residual * weight, jacobian * weight[:, None]
         return jacobian.T @ jacobian, -jacobian.T @ residual, float(residual @ residual)
 
-    x, scatter = columns.T @ SIZES / counts, np.ones(groups.max() + 1)
+    x, scatter = columns.T @ start / counts, np.ones(groups.max() + 1)
     for _ in range(ROUNDS):
         weight = 1 / (std * scatter[groups])
         if len(x):
             x = levenberg_marquardt(normal, x, 1e-13, ROUNDS).x
         residual, jacobian = linearised(x)
         jacobian = jacobian * weight[:, None]
+        if not (np.isfinite(residual).all() and np.isfinite(jacobian).all()):
+            raise EstimateError("the points of the vibration test do not determine this explanation")
         norm = np.linalg.norm(jacobian, axis=0)
         left, singular, right = np.linalg.svd(jacobian / np.where(norm > 0, norm, 1.0), full_matrices=False)
-        if not np.isfinite(residual).all() or singular.min(initial=1.0) < SINGULAR or not (norm > 0).all():
+        if singular.min(initial=1.0) < SINGULAR or not (norm > 0).all():
             raise EstimateError("the points of the vibration test do not determine this explanation")
         # What the fit takes of each group (Förstner 1979).
         freedom = np.bincount(groups, 1 - np.sum(left**2, axis=1))

@@ -16,7 +16,7 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import t as student
 
 from gyromodel.platform._acceptance import AXES, judge_gain, judge_phase, limits_at
-from gyromodel.platform._motion import BaseMotion
+from gyromodel.platform._motion import GIMBALS, BaseMotion
 from gyromodel.platform._vibration import DECIBELS, published_response
 
 # Largest degree of the drift, and most sines of a run: its own and overtones of friction and geometry.
@@ -33,8 +33,10 @@ LEAST_SAMPLES = 60
 CLEAR = 10.0
 AT_REST = "left out, the table is at rest, or moves by no sine"
 LEVEL = 0.95
-# Part of the amplitude that another axis of the table may have before a remark says so.
-OTHER_AXIS = 0.02
+# Part of the amplitude that other motion of the table may have before a remark says so.
+OTHER_MOTION = 0.02
+# Gimbals whose turns add up to roll, azimuth and pitch near zero, as `GIMBALS` counts them.
+TURNING = ((3,), (0, 2), (1,))
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +138,7 @@ def responses(motion: BaseMotion) -> tuple[list[Response], list[str]]:
         response, remark = _response(k + 1, motion.time[rows], motion.base[rows], motion.table[rows], steps)
         found += [response] if response else []
         remarks += [f"run {k + 1}: {remark}"] if remark else []
-    return found, remarks
+    return found, remarks + _still(found, motion)
 
 
 def _response(
@@ -199,8 +201,32 @@ def _response(
         limits=limits_at(w),
     )
     moves = {AXES[k]: np.std(table[:, k]) * np.sqrt(2) / size[1] for k in others}
-    also = [f"{name} ({100 * part:.0f} %)" for name, part in moves.items() if part > OTHER_AXIS]
-    return found, f"the table moves about {' and '.join(also)} too" if also else ""
+    also = [f"{name} ({100 * part:.0f} %)" for name, part in moves.items() if part > OTHER_MOTION]
+    remarks = [f"the table moves about {' and '.join(also)} too"] if also else []
+    # White noise shows in differences, a motion does not.
+    rest = left[:, 1] + columns[:, 2 : 2 * harmonics] @ sines[2 : 2 * harmonics, 1]
+    part = np.sqrt(2 * max(np.mean(rest**2) - 0.5 * np.mean(np.diff(rest) ** 2), 0.0)) / size[1]
+    if part > OTHER_MOTION:
+        remarks.append(
+            f"the table moves by {100 * part:.0f} % of this sine besides, most at {_peak(time, rest)[1]:.3g} rad/s: "
+            "the response is that at one frequency of a motion that has others"
+        )
+    return found, "; ".join(remarks)
+
+
+def _still(found: list[Response], motion: BaseMotion) -> list[str]:
+    """What to say of gimbals that read one value in all runs about an axis that they turn about."""
+    remarks = []
+    for row, axis in zip(motion.mounting, AXES, strict=True):
+        runs = [r.run - 1 for r in found if r.axis == axis]
+        for gimbal in TURNING[int(np.argmax(np.abs(row)))]:
+            readings = motion.gimbals[np.isin(motion.segment, runs), gimbal]
+            if len(readings) and not np.ptp(readings) > 0:
+                remarks.append(
+                    f"{GIMBALS[gimbal]} reads one value while the table moves about {axis}: what the base does there "
+                    "is wrong if its encoder is dead"
+                )
+    return remarks
 
 
 def _frequency(

@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from gyromodel.platform._acceptance import AXES
-from gyromodel.platform._explanations import Alternative, Explanation, loop_and_mount, physical, tested
+from gyromodel.platform._alternatives import Alternative
+from gyromodel.platform._explanations import Explanation, loop_and_mount, physical, shape, tested
 from gyromodel.platform._loop import Loop, measured_response
 from gyromodel.platform._motion import BaseMotion
 from gyromodel.platform._responses import DEGREE, Response, _columns, _sine_covariance
@@ -47,23 +48,25 @@ class _Model(NamedTuple):
 
     loop: Loop
     grounded: Float[Array, ""]
-    integrating: Float[Array, ""]
+    estimated: Float[Array, " 2"]
     integrated: Float[Array, ""]
 
 
 def fit_series(
-    motion: BaseMotion, found: Sequence[Response], alternative: Alternative, integrated: bool = False
-) -> Explanation:
+    motion: BaseMotion, found: Sequence[Response], alternative: Alternative, integrated: bool = False,
+    start: Float[np.ndarray, " entry"] | None = None,
+) -> Explanation:  # fmt: skip
     """Fit an explanation's loop, friction, delay and mount to the angles of all runs at once.
 
-    Beside `explain`, which takes amplitude and phase of each run: the overtones of dry friction count too. Inertia and
-    gain of the loop are the explanation's, as below its crossover only friction over gain shows.
+    Beside `explain`, which takes amplitude and phase of each run: the overtones of dry friction count too. What of the
+    loop is fitted is the explanation's; well below its crossover only friction over gain shows.
 
     Args:
         motion: angles of table and base.
         found: the runs that have a response, with their frequencies.
         alternative: what to fit.
         integrated: whether navigation integrated the rates of the platform.
+        start: entries that the fit begins at.
 
     Returns:
         As of `explain` with known standard errors; residuals are in standard deviations.
@@ -74,10 +77,9 @@ def fit_series(
     parts = [part for response in found for part in _sines(motion, response)]
     sines = _Sines(*map(np.array, zip(*(part[0] for part in parts), strict=True)))
     measured, std = (np.concatenate([part[k] for part in parts]) for k in (1, 2))
-    flags = alternative.grounded, float("corner" in alternative.kinds), float(integrated)
-    model = _Model(Loop(**alternative.loop), *map(jnp.asarray, flags))
+    model = _Model(*shape(alternative), jnp.asarray(float(integrated)))
     columns = tested(alternative, sines)
-    fit = physical(columns, partial(_linearise, sines, model), measured, std)
+    fit = physical(columns, partial(_linearise, sines, model), measured, std, start=start)
     free = len(measured) - columns.shape[1]
     cost = fit.sum_of_squares + 2 * columns.shape[1]
     return Explanation(alternative, fit.value, fit.std, np.ones(2), fit.residual / std, cost, fit.sum_of_squares, free)

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
         test_rows,
         tornado_figure,
     )
-    from gyromodel.report._vibration import vibration_figures, vibration_words
+    from gyromodel.report._vibration import vibration_figures
+    from gyromodel.report._vibration_page import vibration_page
+    from gyromodel.report._vibration_words import vibration_words
 
 __all__ = [
     "deviation_figure",
@@ -38,6 +40,7 @@ __all__ = [
     "test_rows",
     "tornado_figure",
     "vibration_figures",
+    "vibration_page",
     "vibration_words",
     "with_uncertainty",
     "write_report",
@@ -49,5 +52,6 @@ def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'gyromodel.report' has no attribute {name!r}")
     rooms = {"noise_rows": "_deviation", "deviation_figure": "_deviation"}
-    rooms |= {"vibration_figures": "_vibration", "vibration_words": "_vibration"}
+    rooms |= {"vibration_figures": "_vibration", "vibration_words": "_vibration_words"}
+    rooms["vibration_page"] = "_vibration_page"
     return getattr(import_module(f"gyromodel.report.{rooms.get(name, '_study')}"), name)

@@ -62,6 +62,11 @@ def write_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> list[P
 
 def rendered(diagnosis: Diagnosis, drawn: Any) -> str:
     """The page as text."""
+    return filled("template.html", context(diagnosis) | {"figures": drawn})
+
+
+def filled(template: str, values: Mapping[str, Any]) -> str:
+    """A page from its packaged template, with the style that all pages share inside it."""
     import jinja2
 
     from gyromodel.report._drawing import inline
@@ -70,8 +75,11 @@ def rendered(diagnosis: Diagnosis, drawn: Any) -> str:
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters |= {"pretty": _markup, "breakable": _breakable, "inline": inline, "percent": percent}
-    text = resources.files("gyromodel.report").joinpath("template.html").read_text(encoding="utf-8")
-    return environment.from_string(text).render(context(diagnosis), figures=drawn)
+    text, style = (
+        resources.files("gyromodel.report").joinpath(name).read_text(encoding="utf-8")
+        for name in (template, "style.css")
+    )
+    return environment.from_string(text).render(values, style=style, version=_version())
 
 
 def context(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -113,7 +121,6 @@ def context(diagnosis: Diagnosis) -> dict[str, Any]:
         "parameters": _parameters(diagnosis),
         "threshold": _threshold(diagnosis),
         "rate_unit": unit_text(diagnosis.rate_unit),
-        "version": _version(),
     }
 
 

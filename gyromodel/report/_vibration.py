@@ -1,16 +1,14 @@
-"""A vibration test in words and figures: responses with their limits, what explains them, the loop that was assumed."""
+"""A vibration test in figures: angles over time, responses with their limits, what explains them, the loop."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from gyromodel._checks import listed
-from gyromodel.platform import EXCLUDED, Points, assumed_loop, margins, parameters, predicted
+from gyromodel.platform import ENTRIES, Points, assumed_loop, margins, predicted
 from gyromodel.report import _drawing as draw
-from gyromodel.report._numbers import with_uncertainty
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,85 +25,32 @@ _QUANTITIES = ("gain", "phase")
 _LABELS = ("amplitude ratio (dB)", "phase (deg)")
 
 
-class Words(NamedTuple):
-    """A table of runs and sentences below it."""
-
-    head: tuple[str, ...]
-    runs: list[tuple[str, ...]]
-    lines: list[str]
-
-
-def vibration_words(test: VibrationTest) -> Words:
-    """What a terminal shows."""
-    head = ("run", "axis", "rad/s", "dB", "", "deg", "", "arccos, deg", "cross axes, %")
-    return Words(head, [_run(response) for response in test.responses], _lines(test))
-
-
-def _run(found: Response) -> tuple[str, ...]:
-    half = found.quantile
-    gain, phase = (
-        f"{value:+.4f} ± {half * std:.4f}".replace("-", "−")
-        for value, std in ((found.gain, found.gain_std), (found.phase, found.phase_std))
-    )
-    cross = ", ".join(f"{axis} {100 * ratio:.2f}" for axis, (ratio, _) in sorted(found.cross.items()))
-    verdicts = found.verdicts
-    return (
-        str(found.run), found.axis, f"{found.frequency:.4f}", gain, verdicts[0], phase, verdicts[1],
-        f"{found.published[1]:.3f}", cross,
-    )  # fmt: skip
-
-
-def _lines(test: VibrationTest) -> list[str]:
-    lines = [
-        "± are 95 % intervals in noise of the colour that each run shows; a negative phase is late.",
-        "arccos is the published estimator: without sign, and the noise makes it larger.",
-        "Limits are those published for 1, 10, 20 and 30 rad/s; at other frequencies there are none.",
-    ]
-    lines += [f"Note: {remark}." for remark in test.remarks]
-    if not test.explanations:
-        return [*lines, "", "The runs are too few to explain them together."]
-    judged = "the standard errors above" if test.scatter_stated else "the scatter each leaves"
-    excluded = "" if test.scatter_stated else " (the standard errors above exclude every explanation offered here)"
-    lines.append("")
-    if test.left_out:
-        lines.append(
-            f"Axis {test.left_out[0]} is left out below: with it the standard errors above exclude every explanation "
-            "offered here, without it they do not. A shaft that sticks makes such an axis."
-        )
-    runs = "the other runs" if test.left_out else "all runs"
-    lines.append(f"What explains {runs}, judged by {judged}{excluded}:")
-    for name in test.supported:
-        lines.append(f"- {name}: {_values(test.explanations[name])}.")
-    rest = len(test.explanations) - len(test.supported)
-    lines.append(f"{rest} others are {'excluded or ' if test.scatter_stated else ''}far less likely (vibration.json).")
-    if test.series is not None:
-        axes = listed([axis for axis in test.sticking if axis not in test.left_out])
-        without = f", without axis {axes}, where something sticks," if axes else ""
-        if test.series.probability < EXCLUDED:
-            lines.append("Overtones in the angles exclude the first of these: something sticks, or is not of one size.")
-        else:
-            lines.append(f"From the angles themselves, overtones included{without} the first: {_values(test.series)}.")
-    lines.append("Values hold for the loop that each explanation assumes, the first one's in loop.svg.")
-    if test.next_test:
-        apart = f"{test.further[test.next_test]:.1f} standard deviations apart (3.3 are enough)"
-        lines.append(f"These cannot be told apart. One more test, {test.next_test}, all axes, sets them {apart}.")
-    elif len(test.supported) > 1:
-        lines.append("These cannot be told apart, nor by any further test tried.")
-    return lines
-
-
-def _values(found: Explanation) -> str:
-    rows = [f"{row.name} {with_uncertainty(row.value, row.std, row.unit)}" for row in parameters(found)]
-    return ", ".join(rows) or "nothing of it is seen"
-
-
 def vibration_figures(test: VibrationTest) -> dict[str, str]:
-    """SVG by name: the responses with their limits, the explanations, the loop assumed."""
+    """SVG by name: the angles over time, the responses with their limits, the explanations, the loop."""
     with draw.style():
-        figures = {"responses": _responses(test)}
-        if test.explanations:
-            figures |= {"explanations": _explanations(test), "loop": _loop(test)}
-        return figures
+        figures = {"attitude": _attitude(test), "responses": _responses(test)}
+        if test.best:
+            figures |= {"explanations": _explanations(test), "loop": _loop(test, test.best)}
+        return {name: draw.rendered(figure, name) for name, figure in figures.items()}
+
+
+def _attitude(test: VibrationTest) -> Figure:
+    """As figure 5 of the source: base attitude from navigation beside the table; below it what differs."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(2.0 + 3.4 * len(test.histories), 5.0), layout="constrained")
+    grid = figure.subplots(2, len(test.histories), squeeze=False, sharex="col", height_ratios=(3, 2))
+    for (axis, run), (top, bottom) in zip(test.histories.items(), grid.T, strict=True):
+        table, base = np.rad2deg(run.table), np.rad2deg(run.base)
+        top.plot(run.time, table, color=draw.BEFORE_DOT, linewidth=3.6, label="table")
+        top.plot(run.time, base, color=draw.AFTER, linewidth=1.2, label="base, from navigation")
+        bottom.plot(run.time, 1e3 * (base - table), color=draw.MARK, linewidth=1.0)
+        top.set_title(f"axis {axis}, run {run.run}: {run.frequency:.3g} rad/s", fontsize=10.5, color=draw.INK)
+        bottom.set_xlabel("time (s)")
+    grid[0, 0].set_ylabel("angle (deg)")
+    grid[1, 0].set_ylabel("base − table\n(10⁻³ deg)")
+    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=2, frameon=False)
+    return figure
 
 
 def _two(width: float, height: float, columns: int = 1) -> tuple[Figure, np.ndarray]:
@@ -136,16 +81,16 @@ def _by_axis(test: VibrationTest) -> dict[str, list[Response]]:
     return {axis: runs for axis in _COLOURS if (runs := [r for r in test.responses if r.axis == axis])}
 
 
-def _responses(test: VibrationTest) -> str:
+def _responses(test: VibrationTest) -> Figure:
     figure, grid = _two(6.6, 5.6)
     runs = _by_axis(test)
-    best = next(iter(test.explanations.values()), None)
+    best = test.best
     # Axes side by side, where their intervals would cover each other.
     shifts = dict(zip(runs, 1.03 ** (np.arange(len(runs)) - 0.5 * (len(runs) - 1)), strict=True))
     for k, axes in enumerate(grid[:, 0]):
         for axis, own in runs.items():
             _points(axes, own, _QUANTITIES[k], _COLOURS[axis], shifts[axis])
-            if best is not None:
+            if best is not None and axis not in best.left_out:
                 _curve(axes, best, own, k, test.integrated, _COLOURS[axis], "-")
         limited = {r.limits: r.frequency for r in test.responses if r.limits}
         for limits, w in limited.items():
@@ -163,12 +108,12 @@ def _responses(test: VibrationTest) -> str:
         grid[1, 0].set_xticks(frequencies, [f"{w:g}" for w in frequencies])
     grid[1, 0].set_xlabel("frequency (rad/s)")
     draw.legend(grid[0, 0], 4)
-    return draw.rendered(figure, "responses")
+    return figure
 
 
 def _curve(
     axes: Axes, found: Explanation, runs: list[Response], quantity: int, integrated: bool, colour: str, dashes: Any,
-    highest: float = 0.0, label: str | None = None,
+    highest: float = 0.0,
 ) -> None:  # fmt: skip
     """An explanation over the frequencies of an axis, or up to a higher one."""
     low, high = min(r.frequency for r in runs), max(highest, *(r.frequency for r in runs))
@@ -176,21 +121,31 @@ def _curve(
     ones, amplitude = np.ones_like(grid), np.deg2rad(np.mean([r.amplitude for r in runs]))
     number = np.full(len(grid), "XYZ".index(runs[0].axis))
     curve = predicted(found, Points(number, grid, ones, integrated * ones, amplitude * ones))
-    axes.plot(grid, curve[quantity], color=colour, linestyle=dashes, linewidth=1.3, alpha=0.8, label=label, zorder=4)
+    axes.plot(grid, curve[quantity], color=colour, linestyle=dashes, linewidth=1.3, alpha=0.8, zorder=4)
 
 
-def _explanations(test: VibrationTest) -> str:
+def _drawn(test: VibrationTest) -> list[str]:
+    """The possible explanations, and up to as many as are drawn the next best."""
+    rest = [name for name in test.explanations if name not in test.possible]
+    return [*test.possible, *rest][:_DRAWN]
+
+
+def _explanations(test: VibrationTest) -> Figure:
+    from matplotlib.lines import Line2D
+
     runs = _by_axis(test)
     figure, grid = _two(2.2 + 2.6 * len(runs), 5.6, len(runs))
     colours = (draw.AFTER, draw.MARK, draw.BEFORE)
-    shown = list(test.explanations)[:_DRAWN]
+    shown = _drawn(test)
     for (axis, own), column in zip(runs.items(), grid.T, strict=True):
         for k, axes in enumerate(column):
             for name, colour, dashes in zip(shown, colours, _DASHES, strict=False):
-                _curve(axes, test.explanations[name], own, k, test.integrated, colour, dashes, _HIGHEST, name)
+                if axis not in (found := test.explanations[name]).left_out:
+                    _curve(axes, found, own, k, test.integrated, colour, dashes, _HIGHEST)
             _points(axes, own, _QUANTITIES[k], draw.INK)
             axes.set_xscale("log")
-        column[0].set_title(f"axis {axis}", fontsize=10.5, color=draw.INK)
+        unexplained = all(axis in test.explanations[name].left_out for name in shown)
+        column[0].set_title(f"axis {axis}{', left out' * unexplained}", fontsize=10.5, color=draw.INK)
         column[1].set_xlabel("frequency (rad/s)")
         column[1].xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     for k, quantity in enumerate(_QUANTITIES):
@@ -198,13 +153,18 @@ def _explanations(test: VibrationTest) -> str:
         room = _BEYOND * np.ptp(ends)
         grid[k, 0].set_ylim(ends.min() - room, ends.max() + room)
         grid[k, 0].set_ylabel(_LABELS[k])
-    handles, labels = grid[0, 0].get_legend_handles_labels()
-    figure.legend(handles[: len(shown)], labels[: len(shown)], loc="outside upper left", ncols=1, frameon=False)
-    return draw.rendered(figure, "explanations")
+    handles = [
+        Line2D([], [], color=colour, linestyle=dashes, label=name if name in test.possible else f"{name} (less likely)")
+        for name, colour, dashes in zip(shown, colours, _DASHES, strict=False)
+    ]
+    figure.legend(handles=handles, loc="outside upper left", ncols=1, frameon=False)
+    return figure
 
 
-def _loop(test: VibrationTest) -> str:
-    loop: Loop = assumed_loop(next(iter(test.explanations.values())))
+def _loop(test: VibrationTest, best: Explanation) -> Figure:
+    loop: Loop = assumed_loop(best)
+    parts = [part for part in ("corner", "crossover") if part in best.alternative.kinds]
+    whose = f"loop, {' and '.join(parts)} fitted" if parts else "loop assumed, nothing of it fitted"
     grid = np.geomspace(3.0, 3e3, 400)
     response = np.asarray(loop.open_loop(jnp.asarray(grid)))
     size, phase = 20 * np.log10(np.abs(response)), np.rad2deg(np.unwrap(np.angle(response)))
@@ -224,15 +184,16 @@ def _loop(test: VibrationTest) -> str:
     try:
         found = margins(loop)
     except ValueError:
-        top.set_title("loop assumed: it has no margins", fontsize=10.5, color=draw.INK)
-        return draw.rendered(figure, "loop")
+        top.set_title(f"{whose}:\nit has no margins", fontsize=10.5, color=draw.INK)
+        return figure
     turning, marked = grid[np.argmax(size < -found.gain)], {"color": draw.MARK, "linewidth": 2}
     top.plot([turning] * 2, [0, -found.gain], label=f"gain margin {found.gain:.0f} dB", **marked)
     ends = [-180, found.phase - 180]
     bottom.plot([found.crossover] * 2, ends, label=f"phase margin {found.phase:.0f}°", **marked)
-    read = f"crossover {found.crossover:.0f}, bandwidth {found.bandwidth:.0f} rad/s"
-    top.set_title(f"loop assumed: {read}", fontsize=10.5, color=draw.INK)
+    std = best.std[ENTRIES.index("crossover")]
+    read = f"crossover {found.crossover:.0f}{f' ± {std:.1f}' if std else ''}, bandwidth {found.bandwidth:.0f} rad/s"
+    top.set_title(f"{whose}:\n{read}", fontsize=10.5, color=draw.INK)
     for axes in (top, bottom):
         axes.axvline(found.crossover, color=draw.MUTED, linewidth=0.9, linestyle=(0, (4, 3)))
         axes.legend(loc="lower left", frameon=False)
-    return draw.rendered(figure, "loop")
+    return figure
