@@ -74,8 +74,8 @@ class TimeDelay(Effect):
 class Bandwidth(Effect):
     """I += y − ω with y''/w² + τ y' + y = ω: the output follows the rate through a lag, of first order without y''.
 
-    That of second order has a natural frequency, w/(2π), and the damping ratio ½ w τ; beyond one it is two lags of
-    first order in series. The search lets a share of the effect vary to have a linear coefficient, which for a small
+    That of second order has the natural period P = 2π/w, the frequency 1/P, and the damping ratio ½ w τ = π τ/P; beyond
+    one it is two lags of first order in series. The search lets a share of the effect vary to have a linear coefficient, which for a small
     time constant is −τ dω/dt; the fit holds it at one.
     """
 
@@ -90,29 +90,29 @@ class Bandwidth(Effect):
     remembers = True
 
     share: Float[Array, ""] = parameter("1", 1.0, "part of the output that lags", default=1.0)
-    natural_frequency: Float[Array, " second"] = parameter(
-        "Hz", 10.0, "of a lag of second order; its damping ratio is π × this × τ", linear=False, default=()
+    natural_period: Float[Array, " second"] = parameter(
+        "ms", 100.0, "P of a lag of second order, whose damping ratio is π τ/P", linear=False, default=()
     )
     time_constant: Float[Array, ""] = parameter("ms", 1.0, "τ of the lag", linear=False, default=1e-3)
 
     def __check_init__(self) -> None:
         if self.time_constant <= 0:
             raise ValueError("a time constant is above zero")
-        if np.size(self.natural_frequency) > 1 or np.any(np.asarray(self.natural_frequency) <= 0):
-            raise ValueError("natural_frequency takes one value above zero, or none")
+        if np.size(self.natural_period) > 1 or np.any(np.asarray(self.natural_period) <= 0):
+            raise ValueError("natural_period takes one value above zero, or none")
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """y − ω."""
         time, rate = signals["time"], signals["rate"]
-        if self.natural_frequency.size:
-            return stack(second_order_lag(time, rate, self.natural_frequency[0], self.time_constant))
+        if self.natural_period.size:
+            return stack(second_order_lag(time, rate, self.natural_period[0], self.time_constant))
         return stack(lag(time, rate, self.time_constant))
 
     def unknown(self, signals: Signals) -> Bool[Array, " sample"]:
         """The first time constants, as only a steady change before them is allowed for."""
         slowest = self.time_constant
-        if self.natural_frequency.size:
-            slowest = slowest_time_constant(self.natural_frequency[0], slowest)
+        if self.natural_period.size:
+            slowest = slowest_time_constant(self.natural_period[0], slowest)
         return remembered(signals["time"], slowest)
 
     def settled(self) -> Self:
@@ -120,7 +120,7 @@ class Bandwidth(Effect):
         share = jnp.maximum(self.share, 1e-6)
         return type(self)(
             share=jnp.ones(()),
-            natural_frequency=self.natural_frequency / share,
+            natural_period=share * self.natural_period,
             time_constant=share * self.time_constant,
         )
 
@@ -132,7 +132,7 @@ class Bandwidth(Effect):
         step = interval(signals)
         first = [cls(time_constant=t) for t in step * np.geomspace(SHORTEST, LONGEST, STEPS)]
         return first + [
-            cls(natural_frequency=(1.0 / (2.0 * np.pi * t),), time_constant=2.0 * damping * t)
+            cls(natural_period=(2.0 * np.pi * t,), time_constant=2.0 * damping * t)
             for t in step * np.geomspace(FASTEST, LONGEST, PERIODS)
             for damping in DAMPINGS
         ]
@@ -282,7 +282,7 @@ def lag(
 def second_order_lag(
     time: Float[Array, " sample"],
     values: Float[Array, " sample"],
-    natural_frequency: Float[Array, ""],
+    natural_period: Float[Array, ""],
     time_constant: Float[Array, ""],
 ) -> Float[Array, " sample"]:
     """Output less input of a second-order lag, which begins each stretch as the first-order one does.
@@ -295,7 +295,7 @@ def second_order_lag(
     step = jnp.diff(clock, prepend=clock[0] - 1.0)
     rising = slope(time, values)
     bending = slope(time, rising)
-    tau, square = time_constant, (2.0 * jnp.pi * natural_frequency) ** 2
+    tau, square = time_constant, (2.0 * jnp.pi / natural_period) ** 2
     second, third = tau**2 - 1.0 / square, -tau * (tau**2 - 2.0 / square)
     rising_before, bending_before = (jnp.concatenate([v[:1], v[:-1]]) for v in (rising, bending))
     # ω'' is that of the chord of ω', less and plus half of what ω''' changes in a step.
@@ -341,9 +341,9 @@ def _series(z2: Float[Array, " sample"], odd: int) -> Float[Array, " sample"]:
     return sum((z2**k / math.factorial(2 * k + odd) for k in range(1, 7)), jnp.ones_like(z2))
 
 
-def slowest_time_constant(natural_frequency: Float[Array, ""], time_constant: Float[Array, ""]) -> Float[Array, ""]:
+def slowest_time_constant(natural_period: Float[Array, ""], time_constant: Float[Array, ""]) -> Float[Array, ""]:
     """How slowly a second-order lag forgets: 2/(τ w²) where it swings, else the longer of its two time constants."""
-    square = (2.0 * jnp.pi * natural_frequency) ** 2
+    square = (2.0 * jnp.pi / natural_period) ** 2
     apart = time_constant**2 - 4.0 / square
     damped = 0.5 * (time_constant + jnp.sqrt(jnp.maximum(apart, 0.0)))
     return jnp.where(apart > 0, damped, 2.0 / (time_constant * square))
