@@ -75,8 +75,8 @@ class Bandwidth(Effect):
     """I += y − ω with y''/w² + τ y' + y = ω: the output follows the rate through a lag, of first order without y''.
 
     That of second order has the natural period P = 2π/w, the frequency 1/P, and the damping ratio ½ w τ = π τ/P; beyond
-    one it is two lags of first order in series. The search lets a share of the effect vary to have a linear coefficient, which for a small
-    time constant is −τ dω/dt; the fit holds it at one.
+    one it is two lags of first order in series. The search lets a share of the effect vary to have a linear
+    coefficient, which for a small time constant is −τ dω/dt; the fit holds it at one.
     """
 
     id = "bandwidth"
@@ -132,7 +132,7 @@ class Bandwidth(Effect):
         step = interval(signals)
         first = [cls(time_constant=t) for t in step * np.geomspace(SHORTEST, LONGEST, STEPS)]
         return first + [
-            cls(natural_period=(2.0 * np.pi * t,), time_constant=2.0 * damping * t)
+            cls(natural_period=jnp.asarray([2.0 * np.pi * t]), time_constant=2.0 * damping * t)
             for t in step * np.geomspace(FASTEST, LONGEST, PERIODS)
             for damping in DAMPINGS
         ]
@@ -287,8 +287,9 @@ def second_order_lag(
 ) -> Float[Array, " sample"]:
     """Output less input of a second-order lag, which begins each stretch as the first-order one does.
 
-    d = y − ω follows d''/w² + τ d' + d = −τ ω' − ω''/w². Where ω' is a parabola, as between samples, so is one d:
-    −τ ω' + (τ² − w⁻²) ω'' − τ (τ² − 2w⁻²) ω'''; what differs from it swings freely, by the exponential of a matrix.
+    w = 2π over the natural period; d = y − ω follows d''/w² + τ d' + d = −τ ω' − ω''/w². Where ω' is a parabola, as
+    between samples, so is one d: −τ ω' + (τ² − w⁻²) ω'' − τ (τ² − 2w⁻²) ω'''; what differs from it swings freely, by
+    the exponential of a matrix.
     """
     clock, first, _ = _clock(time)
     begins = first == jnp.arange(len(time))
