@@ -336,6 +336,11 @@ def test_the_fit_s_reference_points_are_used(rng: np.random.Generator):
         ((ScaleFactor(value=value(2.0), unit="count/deg"),), "V", "scale_factor is in count/deg"),
         ((TimeDelay(delay=value(0.1)),), "rad/s", "time_delay depends on the rates around a sample"),
         ((Bandwidth(time_constant=value(0.1)),), "rad/s", "bandwidth depends on the rates around a sample"),
+        (
+            (Bandwidth(natural_period=value(0.2)[None], time_constant=value(0.1)),),
+            "rad/s",
+            "bandwidth depends on the rates around a sample",
+        ),
     ],
 )
 def test_what_does_not_fit_the_campaign_is_refused(effects: tuple[Effect, ...], unit: str, expected: str):

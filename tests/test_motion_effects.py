@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from gyromodel.diagnosis import isolability
 from gyromodel.diagnosis._added_tests import added_tests
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.effects.acceleration import BiasAccelerationSquared
-from gyromodel.effects.dynamics import Bandwidth, TimeDelay, earlier, lag, slope
+from gyromodel.effects.dynamics import Bandwidth, TimeDelay, earlier, lag, second_order_lag, slope
 from gyromodel.model import GyroModel, ModelError, model_from_effects
 from gyromodel.plan import read_plan
 from gyromodel.signals import read_signals
@@ -92,7 +93,7 @@ def test_simulators_follow_their_closed_forms(rng: np.random.Generator):
 
 
 def test_simulated_delay_and_lag_have_their_frequency_response(rng: np.random.Generator):
-    """One sine: a delay turns its phase by −ωδ, a lag multiplies by 1/(1 + iωτ)."""
+    """One sine: a delay turns its phase by −ωδ, a lag multiplies by 1/(1 + iωτ), or 1/(1 + iωτ − ω²/w²), w = 2ζ/τ."""
     design = MOTION_DESIGNS["dynamic_rates"](rng)
     omega, phase = 2 * np.pi * 3.0, 0.4
     sine = Sines(np.ones(1), np.array([omega]), np.array([phase]))
@@ -103,6 +104,12 @@ def test_simulated_delay_and_lag_have_their_frequency_response(rng: np.random.Ge
         response = 1 / (1 + 1j * omega * tau)
         expected = np.imag(response * np.exp(1j * (omega * t + phase))) - sine(t)
         assert error("bandwidth", design, tau, {}) == pytest.approx(expected, abs=2e-4 * np.abs(expected).max())
+    for natural, damping in ((12.0, 0.7), (5.0, 0.4), (12.0, 1.0), (8.0, 1.5)):
+        w = 2 * np.pi * natural
+        response = 1 / (1 + 2j * damping * omega / w - (omega / w) ** 2)
+        expected = np.imag(response * np.exp(1j * (omega * t + phase))) - sine(t)
+        found = error("bandwidth", design, 2 * damping / w, {"damping": damping})
+        assert found == pytest.approx(expected, abs=1e-5 * np.abs(expected).max())
     assert error("output_axis_acceleration", design, 2.0, {}) == pytest.approx(2 * omega * np.cos(omega * t + phase))
 
 
@@ -116,7 +123,12 @@ def test_delay_lag_and_slope_keep_to_their_stretch():
     for s in stretches:
         alone = jnp.asarray(s), jnp.asarray(np.sin(0.3 * s))
         here = slice(start, start + len(s))
-        for of in (lambda t, v: earlier(t, v, jnp.asarray(1.7)), lambda t, v: lag(t, v, jnp.asarray(0.8)), slope):
+        for of in (
+            lambda t, v: earlier(t, v, jnp.asarray(1.7)),
+            lambda t, v: lag(t, v, jnp.asarray(0.8)),
+            lambda t, v: second_order_lag(t, v, jnp.asarray(5.0), jnp.asarray(0.8)),
+            slope,
+        ):
             assert np.asarray(of(time, values))[here] == pytest.approx(np.asarray(of(*alone)), abs=1e-12)
         assert np.asarray(slope(*alone))[2:-2] == pytest.approx(0.3 * np.cos(0.3 * s[2:-2]), abs=1e-3)
         assert np.asarray(earlier(*alone, jnp.asarray(1.7)))[2:] == pytest.approx(np.sin(0.3 * (s[2:] - 1.7)), abs=2e-3)
@@ -338,11 +350,74 @@ def test_a_rate_is_followed_between_gaps() -> None:
 
 
 @pytest.mark.long
-def test_a_response_of_second_order_has_no_name() -> None:
-    """A loop that rings at 12 Hz, which no delay or lag of first order is."""
+@pytest.mark.parametrize("times", [40.0, 1000.0])
+@pytest.mark.parametrize(("natural", "damping"), [(12.0, 0.7), (5.0, 0.4), (12.0, 1.0)])
+def test_a_loop_of_second_order_is_named_with_its_period_and_damping(natural, damping, times) -> None:
+    """Of up to 1000 times the noise, where a part in 10⁴ of interpolation is a tenth of it."""
+    rng = np.random.default_rng(1)
+    design = MOTION_DESIGNS["dynamic_rates"](rng)
+    tau = damping / (np.pi * natural)
+    missing = error("bandwidth", design, tau, {"damping": damping})
+    output = design.true["rate"] + missing + missing.std() / times * rng.standard_normal(len(missing))
+    found = gyromodel.diagnose(
+        campaign_of(design, output), model_from_effects(["scale_factor", "bias"]), hold_out=False
+    )
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["bandwidth"])
+    told = {p.name: p for p in found.causes[0].parameters}
+    for name, true in (("natural_period", 1 / natural), ("time_constant", tau)):
+        assert told[name].value == pytest.approx(1e3 * true, abs=4 * told[name].std)
+
+
+@pytest.mark.long
+def test_a_loop_that_rings_is_named() -> None:
+    """At 12 Hz with a damping ratio of 0.35, by tones of up to 3 Hz."""
     ringing, damping = 2 * np.pi * 12, 0.35
     campaign = answered(through([ringing**2], [1, 2 * damping * ringing, ringing**2]), seed=1)
+    found = gyromodel.diagnose(campaign, model_from_effects(["scale_factor", "bias"]), hold_out=False)
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["bandwidth"])
+    told = {p.name: p for p in found.causes[0].parameters}
+    assert told["natural_period"].value == pytest.approx(1e3 / 12, rel=0.005)
+
+
+@pytest.mark.long
+def test_a_response_that_no_lag_or_delay_is_has_no_name() -> None:
+    """A notch at 1.2 Hz, amid the tones."""
+    w = 2 * np.pi * 1.2
+    campaign = answered(through([1.0, 0.2 * w, w**2], [1.0, 1.4 * w, w**2]), seed=1)
     found = gyromodel.diagnose(campaign, model_from_effects(["scale_factor", "bias"]), hold_out=False)
     assert found.verdict == "unknown"
     assert found.driver
     assert found.driver.column == "d(rate)/dt"
+
+
+def test_a_loop_of_second_order_is_written_and_read(tmp_path) -> None:
+    loop = Bandwidth(natural_period=jnp.asarray([1 / 12]), time_constant=jnp.asarray(0.0186))
+    gyromodel.write_model(GyroModel((loop,)), tmp_path / "model.yaml")
+    assert "natural_period" in (tmp_path / "model.yaml").read_text()
+    read = gyromodel.read_model(tmp_path / "model.yaml").effects[0]
+    assert isinstance(read, Bandwidth)
+    assert np.asarray(read.natural_period) == pytest.approx([1 / 12], rel=1e-5)
+    assert float(read.time_constant) == pytest.approx(0.0186, rel=1e-5)
+    for periods in ((-0.1,), (0.1, 0.2)):
+        with pytest.raises(ValueError, match="natural_period takes one value above zero"):
+            Bandwidth(natural_period=jnp.asarray(periods))
+
+
+@pytest.mark.parametrize("damping", [0.2, 0.999, 1.0, 1.0 + 1e-9, 4.0])
+def test_a_lag_of_second_order_is_exact_at_any_damping(damping: float) -> None:
+    """A rate of t², of which d = −2τt + 2(τ² − κ) once the start is forgotten, κ = 1/w²; derivatives by differences."""
+    time, period = jnp.arange(800) * 0.01, 0.1
+    tau, kappa = damping * period / np.pi, (period / (2 * np.pi)) ** 2
+    found = second_order_lag(time, time**2, jnp.asarray(period), jnp.asarray(tau))
+    expected = -2 * tau * time + 2 * (tau**2 - kappa)
+    assert np.asarray(found - expected)[time > 7] == pytest.approx(0.0, abs=1e-9)
+    swinging, at = jnp.sin(20 * time + 0.3), jnp.asarray([period, tau])
+
+    def lagging(shape):
+        return second_order_lag(time, swinging, shape[0], shape[1])
+
+    derivatives = np.asarray(jax.jacfwd(lagging)(at))
+    for i in (0, 1):
+        step = jnp.zeros(2).at[i].set(1e-5 * at[i])
+        differences = np.asarray(lagging(at + step) - lagging(at - step)) / float(2 * step[i])
+        assert derivatives[:, i] == pytest.approx(differences, abs=1e-6 * np.abs(differences).max())

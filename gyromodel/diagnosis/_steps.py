@@ -156,7 +156,8 @@ class Steps:
         each = [Found(name, *addition(scanner, estimate, ranking, name, rows, form), ranking) for form in forms]
         if len(each) < 2:
             return each[0]
-        fits = [self.fit(standing([*found, step])) for step in each]
+        given_up = Found("", None, rows_of(each), ranking)
+        fits = [self.fit(standing([*found, step, given_up])) for step in each]
         return max(zip(fits, each, strict=True), key=lambda pair: _quality(pair[0]) if pair[0] else -np.inf)[1]
 
     def _seen(self, estimate: Estimate) -> Scanner:

@@ -100,9 +100,14 @@ def time_delay(design: Design, amplitude: float) -> Array:
     return rate(time - amplitude) - rate(time)
 
 
-def bandwidth(design: Design, amplitude: float) -> Array:
-    """A first-order loop integrated on a fine grid (trapezoidal rule), running for long before the first sample."""
+def bandwidth(design: Design, amplitude: float, damping: float | None = None) -> Array:
+    """A first-order loop integrated on a fine grid (trapezoidal rule), running for long before the first sample.
+
+    With a damping ratio one of second order, of the natural frequency 2 damping/amplitude.
+    """
     assert design.motion is not None
+    if damping is not None:
+        return _loop(design, 2 * damping / amplitude, damping)
     rate, time = design.motion["rate"], design.true["time"]
     step = design.step / FINE
     start = max(int(np.ceil(25 * abs(amplitude) / design.step)), 1) * FINE
@@ -121,6 +126,32 @@ def bandwidth(design: Design, amplitude: float) -> Array:
     for i in range(1, len(fine)):
         lag[i] = ((1 - a) * lag[i - 1] - (forced[i] - forced[i - 1])) / (1 + a)
     return lag[start::FINE]
+
+
+def _loop(design: Design, natural: float, damping: float) -> Array:
+    """A mass on a spring and a damper that the rate pulls at, output and its slope by Runge and Kutta's rule."""
+    assert design.motion is not None
+    rate, time = design.motion["rate"], design.true["time"]
+    step = design.step / FINE
+    slowest = natural * (damping - np.sqrt(max(damping**2 - 1, 0.0)))
+    start = int(np.ceil(25 / slowest / design.step)) * FINE
+    forced = rate((np.arange(2 * (start + (len(time) - 1) * FINE) + 1) - 2 * start) * step / 2)
+
+    def pulled(y: float, slope: float, u: float) -> tuple[float, float]:
+        return slope, natural * (natural * (u - y) - 2 * damping * slope)
+
+    output = np.empty((len(forced) + 1) // 2)
+    output[0], slope = forced[0], 0.0
+    y = output[0]
+    for i in range(1, len(output)):
+        before, between, after = forced[2 * i - 2 : 2 * i + 1]
+        a, p = pulled(y, slope, before)
+        b, q = pulled(y + step / 2 * a, slope + step / 2 * p, between)
+        c, r = pulled(y + step / 2 * b, slope + step / 2 * q, between)
+        d, s = pulled(y + step * c, slope + step * r, after)
+        y, slope = y + step / 6 * (a + 2 * b + 2 * c + d), slope + step / 6 * (p + 2 * q + 2 * r + s)
+        output[i] = y
+    return output[start::FINE] - rate(time)
 
 
 MOTION_EFFECTS: dict[str, Effect] = {f"bias_acceleration_{axis}": _acceleration(axis) for axis in AXES} | {
