@@ -9,7 +9,7 @@ from math import comb
 import numpy as np
 from scipy import stats
 
-from gyromodel._checks import listed
+from gyromodel._checks import listed, thermometers
 from gyromodel.campaign import Campaign
 from gyromodel.declarations import EARLIER, RATE_OF, measured
 from gyromodel.diagnosis._apart import like, separation, twins
@@ -42,6 +42,8 @@ NO_EDGE = ("bias_drift", "bias_warmup")
 VAGUE = 2.0
 # Times the saw tooth of rounding that a line of its making may be, and steps over which the output has to move for it.
 ROUNDED = 2.0
+# Nats below which a cause is faint, and times that by which a stronger one of the same thermometer outdoes it.
+FAINT, OUTDONE = 10.0, 10.0
 # Parts of an interval by which samples may be off a regular grid before they tell a line from its aliases.
 IRREGULAR = 0.01
 # Gross errors that are listed by row.
@@ -203,6 +205,8 @@ def judge(
     if len(vague) > 1:
         shared = dict.fromkeys(vague, 1.0 / len(vague))
         sets = [members | shared if c.effect in vague else members for c, members in zip(causes, sets, strict=True)]
+    sets = [members | _left_by(c, causes, extended) if len(members) == 1 else members
+            for c, members in zip(causes, sets, strict=True)]  # fmt: skip
     order = sorted(range(len(causes)), key=lambda i: -causes[i].statistic)
     causes, sets = [causes[i] for i in order], [sets[i] for i in order]
     if selection.remains and not selection.unresolved:
@@ -251,6 +255,16 @@ def judge(
     firm = tuple(c for c in named if c.effect not in sets[0])
     test = _next_test(list(sets[0]), record, causes[0])
     return Judgement("ambiguous", (*doubtful, *firm), sets[0], None, test, unexplained, tuple(findings))
+
+
+def _left_by(cause: Cause, causes: Sequence[Cause], estimate: Estimate) -> dict[str, float]:
+    """The far stronger thermal cause of which a faint one may be what its form, or a thermometer's noise, leaves."""
+    if cause.statistic > FAINT or is_noise(cause.effect):
+        return {}
+    needs = {e.label: set(thermometers(e.columns_needed)) for e in estimate.model.effects}
+    own = needs.get(cause.effect, set())
+    others = [c for c in causes if c.statistic > OUTDONE * cause.statistic and own & needs.get(c.effect, set())]
+    return {max(others, key=lambda c: c.statistic).effect: 0.5} if others else {}
 
 
 def _aliases(estimate: Estimate) -> str:

@@ -12,7 +12,7 @@ from gyromodel.effects._base import Effect, Signals, parameter, stack
 from gyromodel.numerics.play import play
 
 # Half widths searched, as parts of the driver's range: the widest loops are hardly more than a line over the driver.
-NARROWEST, WIDEST, WIDTHS = 0.01, 0.3, 13
+WIDEST, NEXT = 0.3, 1.33
 # Samples at least on either branch of a loop, and as a part of all.
 FEWEST, SHARE = 3, 0.02
 
@@ -26,6 +26,7 @@ class _Hysteresis(Effect):
 
     remembers = True
     driver: ClassVar[str]
+    narrowest: ClassVar[float] = 0.01
     height: Float[Array, ""] = parameter("deg/h", 1.0, "half of the loop's height; positive: higher on the way up")
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
@@ -42,7 +43,9 @@ class _Hysteresis(Effect):
     def candidates(cls, signals: Signals) -> list[Self]:
         """Loops of which the campaign holds both branches."""
         x = np.asarray(signals[cls.driver])
-        tried = [cls(half_width=w) for w in np.ptp(x) * np.geomspace(NARROWEST, WIDEST, WIDTHS)]  # type: ignore[call-arg]
+        number = 1 + round(np.log(WIDEST / cls.narrowest) / np.log(NEXT))
+        widths = np.ptp(x) * np.geomspace(cls.narrowest, WIDEST, number)
+        tried = [cls(half_width=w) for w in widths]  # type: ignore[call-arg]
         # Padded rows repeat the last one, its time too.
         rows = np.diff(np.asarray(signals["time"]), prepend=-np.inf) != 0
         fewest = max(FEWEST, SHARE * rows.sum())
@@ -71,6 +74,7 @@ class RateHysteresis(_Hysteresis):
     site = "rate"
     needs = ("rate",)
     driver = "rate"
+    narrowest = 0.001  # a reference rate has no noise that would close such a loop
     cause = "Friction, backlash of the pick-off or magnetic remanence of the torquer keeps part of the last turn."
     test = "Oscillate at two frequencies of one rate amplitude: the loop stays as it is, that of a delay grows."
     untested = "the rate never turns back far enough to close a loop"
