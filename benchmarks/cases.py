@@ -173,7 +173,8 @@ def rlg_static(folder: Path) -> list[str]:
     found = gyromodel.diagnose(gyromodel.read_campaign(path).axis("x"), model, hold_out=False)
     named = ", ".join(f"{c.effect} ({c.statistic:.0f})" for c in found.causes) or "–"
     follows = f", follows {found.driver.column}" if found.driver else ""
-    said = f"`diagnose` of x beside a bias, {time.perf_counter() - start:.0f} s: {found.verdict}{follows}; causes: {named}."
+    spent = time.perf_counter() - start
+    said = f"`diagnose` of x beside a bias, {spent:.0f} s: {found.verdict}{follows}; causes: {named}."
     return [*table(head, rows), "", said, "", *(f"- {line}" for line in found.findings)]
 
 
