@@ -56,7 +56,8 @@ def vibration_page(test: VibrationTest, figures: Mapping[str, str], campaign: st
             "runs": words.runs,
             "notes": notes(test),
             "rows": _rows(test),
-            "lines": [line for line in (lines if further else [*lines, last]) if not line.startswith("- ")],
+            # What is listed there is the table here.
+            "lines": [line for line in (lines if further else [*lines, last]) if line[:2] != "- " and line[-1] != ":"],
             "next_test": last.removeprefix("Next test: ").capitalize() if test.few else (last if further else None),
             "findings": test.remarks,
             "figures": figures,
@@ -81,7 +82,6 @@ def _rows(test: VibrationTest) -> list[dict[str, Any]]:
                 "verdict": verdict,
                 "chosen": name in test.possible,
                 "criterion": f"{e.criterion - best:.1f}",
-                "freedom": e.degrees_of_freedom,
                 "probability": number(e.probability) if test.scatter_stated else "–",
                 "numbers": [f"{row.name} {with_uncertainty(row.value, row.std, row.unit)}" for row in parameters(e)],
             }
