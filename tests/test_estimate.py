@@ -198,7 +198,7 @@ def test_propagation_is_the_derivative_by_hand_and_the_spread_of_draws(nonlinear
 
     def at_ten_minutes(model: GyroModel):
         warmup = model.effects[4]
-        return warmup.amplitude * jnp.exp(-600.0 / warmup.time_constant)  # type: ignore[attr-defined]
+        return warmup.amplitude[0] * jnp.exp(-600.0 / warmup.time_constant[0])  # type: ignore[attr-defined]
 
     later = nonlinear.propagate(at_ten_minutes)
     value, variance = later.value, later.covariance

@@ -27,7 +27,7 @@ from gyromodel.diagnosis._search import Progress, Selection, search, significant
 from gyromodel.diagnosis._shapes import driver_shape, minimum_detectable, not_testable
 from gyromodel.diagnosis._steps import EXCHANGE, Found, NoisePath, Steps, standing
 from gyromodel.diagnosis._variance import follow, growing_noise, noise_level, tails, with_variance
-from gyromodel.diagnosis._verdict import judge, structured, with_noise
+from gyromodel.diagnosis._verdict import FAINT, judge, structured, with_noise
 from gyromodel.estimate import Estimate, EstimateError, check_covariates, fit_record, with_noise_intervals
 from gyromodel.model import GyroModel, record_span
 from gyromodel.noise import NoiseGrid, NoiseRatios, noise_grid
@@ -200,7 +200,8 @@ def diagnose(
         )
     steps = Steps(session.scanner, baseline, session.threshold)
     judgement = judge(steps, selection, extended, len(bank.names()), nulls, data.rows_of)
-    if following and grows and judgement.verdict == "adequate":
+    # What follows itself at one end of a column has structure, whatever faint name takes a part of it.
+    if following and grows and all(c.statistic < FAINT for c in judgement.causes):
         judgement = structured(judgement, selection.last, grows.column)
     stepped = None
     if record.domain == "gyro" and not _unfinished(selection) and (free := _with_noise_estimated(selection.estimate)):
