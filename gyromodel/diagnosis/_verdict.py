@@ -262,7 +262,8 @@ def _left_by(cause: Cause, causes: Sequence[Cause], estimate: Estimate) -> dict[
     if cause.statistic > FAINT or is_noise(cause.effect):
         return {}
     needs = {e.label: set(thermometers(e.columns_needed)) for e in estimate.model.effects}
-    own = needs.get(cause.effect, set())
+    # A chamber's pace is a line.
+    own = set().union(*needs.values()) if cause.effect == "bias_periodic" else needs.get(cause.effect, set())
     others = [c for c in causes if c.statistic > OUTDONE * cause.statistic and own & needs.get(c.effect, set())]
     return {max(others, key=lambda c: c.statistic).effect: 0.5} if others else {}
 
