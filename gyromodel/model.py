@@ -295,8 +295,11 @@ def effect_class(label: str) -> type[Effect]:
         return CATALOGUE[label]
     if label.startswith("bias_") and label not in ("bias_", "bias_column"):
         return BiasColumn
-    known = ", ".join(sorted(set(CATALOGUE) - {"bias_column"}))
-    raise ModelError(f"unknown effect {label}; the catalogue has {known}, and bias_<column> for any other column")
+    close = get_close_matches(label, CATALOGUE.keys() - {"bias_column"}, n=3, cutoff=0.4)
+    hint = f"did you mean {' or '.join(close)}? " if close else ""
+    raise ModelError(
+        f"unknown effect {label}; {hint}`gyromodel effects` lists the catalogue, and bias_<column> is any other column's"
+    )
 
 
 def make_effect(label: str) -> Effect:

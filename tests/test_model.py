@@ -134,8 +134,10 @@ def test_unknown_noise_is_named():
 
 def test_unknown_effects_and_missing_columns_are_named(rng: np.random.Generator):
     for label in ("bias_column", "bias_", "thermal_bias", ""):
-        with pytest.raises(ModelError, match=r"unknown effect .*; the catalogue has bandwidth, bias, bias_acc"):
+        with pytest.raises(ModelError, match=r"unknown effect .*; .*`gyromodel effects` lists the catalogue"):
             effect_class(label)
+    with pytest.raises(ModelError, match=r"did you mean bias_warmup"):
+        effect_class("warm_up")
     assert effect_class("bias_supply_voltage") is BiasColumn
     record = read_signals(campaign(rng))
     for labels, column in ((["bias_pressure"], "pressure"), (["bias", "bias_temperature"], "temperature")):
