@@ -298,7 +298,7 @@ def effect_class(label: str) -> type[Effect]:
     close = get_close_matches(label, CATALOGUE.keys() - {"bias_column"}, n=3, cutoff=0.4)
     hint = f"did you mean {' or '.join(close)}? " if close else ""
     raise ModelError(
-        f"unknown effect {label}; {hint}`gyromodel effects` lists the catalogue, and bias_<column> is any other column's"
+        f"unknown effect {label}; {hint}`gyromodel effects` lists the catalogue, and bias_<column> is for any column"
     )
 
 

@@ -50,6 +50,8 @@ IRREGULAR = 0.01
 ROWS_TOLD = 12
 # A driver that names leave with more than this share of the structure makes the discrepancy unknown.
 UNKNOWN_SHARE = 0.05
+# So does one with more than this part of the strongest name's evidence: names that follow one another never end it.
+UNKNOWN_EVIDENCE = 0.25
 
 
 @dataclass(frozen=True)
@@ -217,7 +219,8 @@ def judge(
         )
     driver, share = remaining(scanner, baseline, selection)
     unexplained = {" and ".join(smooth_columns(driver)): share} if driver else {}
-    if driver and (not causes or share > UNKNOWN_SHARE):
+    strongest = max((c.statistic for c in causes), default=0.0)
+    if driver and (share > UNKNOWN_SHARE or selection.last.statistic[driver] > UNKNOWN_EVIDENCE * strongest):
         columns = smooth_columns(driver)
         bases, forms = zip(*(measured(c) for c in columns), strict=True)
         how = "in steps up and down"
