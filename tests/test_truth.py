@@ -295,6 +295,7 @@ SCANNED = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "effect"), SCANNED)
 def test_search_over_shapes_has_about_the_power_the_mde_promises(name, effect, rng):
     """Over every shape at once, at 1 %/20 false alarms: 80 %, but for what noise of another colour makes of trials."""
