@@ -71,15 +71,18 @@ def filled(template: str, values: Mapping[str, Any]) -> str:
 
     from gyromodel.report._drawing import inline
 
+    def packaged(name: str) -> str:
+        return resources.files("gyromodel.report").joinpath(name).read_text(encoding="utf-8")
+
     environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=jinja2.FunctionLoader(packaged),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
     environment.filters |= {"pretty": _markup, "breakable": _breakable, "inline": inline, "percent": percent}
-    text, style = (
-        resources.files("gyromodel.report").joinpath(name).read_text(encoding="utf-8")
-        for name in (template, "style.css")
-    )
-    return environment.from_string(text).render(values, style=style, version=_version())
+    return environment.get_template(template).render(values, style=packaged("style.css"), version=_version())
 
 
 def context(diagnosis: Diagnosis) -> dict[str, Any]:
