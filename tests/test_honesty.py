@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, chi2
 
 import gyromodel as gm
 from gyromodel.averages import average
@@ -20,6 +20,7 @@ from gyromodel.model import ModelError
 from gyromodel.model_files import read_model, write_model
 from gyromodel.noise import NoiseRatios
 from gyromodel.signals import rate_output, read_signals
+from tests.truth import noise
 
 ROWS = 240
 TIME = 10.0 * np.arange(ROWS)
@@ -413,3 +414,19 @@ def test_a_strong_line_is_no_curve(curve: float):
         wrong += found.verdict == "named" and found.causes[0].effect != name
         assert name in found.credible_set
     assert wrong <= binom.ppf(1 - 1e-4, draws, 0.02)
+
+
+@pytest.mark.long
+def test_the_shift_of_a_dwell_has_the_uncertainty_of_coloured_noise(rng: np.random.Generator) -> None:
+    """In flicker noise the mean of twenty samples is three times less certain than white noise would have it."""
+    squares = []
+    for _ in range(10):
+        rate = np.repeat(rng.permutation(np.linspace(-100.0, 100.0, 30)), 20)
+        drawn = noise.flicker(len(rate), 1.0, 0.05, rng) + 0.05 * rng.standard_normal(len(rate))
+        output = rate + drawn + 3.0 * (np.arange(len(rate)) // 20 == 7)
+        columns = {"time": np.arange(len(rate), dtype=float), "rate": rate, "output": output}
+        campaign = gm.Campaign(columns, {"time": "s", "rate": "deg/s", "output": "deg/s"}, {"kind": "rate"})
+        found = gm.diagnose(campaign, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
+        [shift] = [p for c in found.causes for p in c.parameters if p.name.startswith("shift")]
+        squares.append(((shift.value - 3.0) / shift.std) ** 2)
+    assert 1e-5 < chi2.sf(sum(squares), len(squares)) < 1 - 1e-5

@@ -4,26 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import comb
 
 import numpy as np
-from scipy import stats
 
 from gyromodel._checks import listed, thermometers
 from gyromodel.campaign import Campaign
 from gyromodel.declarations import EARLIER, RATE_OF, measured
-from gyromodel.diagnosis._apart import like, separation, twins
+from gyromodel.diagnosis._apart import like, twins
+from gyromodel.diagnosis._causes import cause_of
 from gyromodel.diagnosis._drivers import smooth_columns
-from gyromodel.diagnosis._epochs import epoch_interval
-from gyromodel.diagnosis._evidence import log_evidence_ratio
 from gyromodel.diagnosis._exchange import uncontested
 from gyromodel.diagnosis._lines import lines_of
 from gyromodel.diagnosis._points import levels
 from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, ease, is_driver, is_noise
-from gyromodel.diagnosis._result import Cause, Confuser, ParameterValue, Verdict
+from gyromodel.diagnosis._result import Cause, ParameterValue, Verdict
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import TIME_MARGIN, Selection
-from gyromodel.diagnosis._selected import after_selection, least_told
 from gyromodel.diagnosis._shapes import remaining
 from gyromodel.diagnosis._steps import Found, Steps
 from gyromodel.diagnosis._variance import quantum
@@ -199,7 +195,7 @@ def judge(
         findings += [close] if close else []
         turn = sum(f.name == name for f in found[i:])
         least = steps.threshold - (0.0 if i else ease(name, ranking.walks[ranking.best_cell(name)]))
-        causes.append(_cause(scanner, extended, step, turn, ranking, members, statistic, trials, null_scores, least))
+        causes.append(cause_of(scanner, extended, step, turn, ranking, members, statistic, trials, null_scores, least))
         sets.append(members)
     # Of these only something in common has a size: which of them it is, this campaign cannot tell.
     sizes = [_fitted(c) for c in causes]
@@ -430,94 +426,3 @@ def _next_test(names: list[str], record: Record, cause: Cause) -> str:
         )
     tests = [effect_class(n).test for n in names if n != "outliers" and not n.startswith("noise_")]
     return " ".join(dict.fromkeys(tests))
-
-
-def _cause(
-    scanner: Scanner,
-    estimate: Estimate,
-    step: Found,
-    turn: int,
-    ranking: Ranking,
-    members: dict[str, float],
-    statistic: float,
-    trials: int,
-    null_scores: np.ndarray,
-    least: float,
-) -> Cause:
-    name = step.name
-    if step.frees_noise:
-        sizes = tuple(
-            ParameterValue(part, float(row["value"]), (float(row["hi"]) - float(row["lo"])) / 3.92, str(row["unit"]))
-            for part, row in estimate.noise_table().items()
-            if part.startswith(name)
-        )
-        p = float(np.exp(-max(statistic, 0.0)))
-        return Cause(name, sizes, statistic, p, min(1.0, p * trials), members.get(name, 0.0))
-    g = ranking.best_cell(name)
-    result = ranking.results[g]
-    _, explained, q = result.best[name]
-    nu = scanner.degrees_of_freedom - ranking.baseline_columns.shape[1]
-    p = float(stats.beta.sf(min(explained / result.rss, 1.0), q / 2, max(nu - q, 1) / 2))
-    shapes = comb(len(scanner.points), int(q)) if step.points else len(result.energy.get(name, ())) or 1
-    adjusted = float(min(1.0, p * shapes * trials))
-    if len(null_scores):
-        adjusted = float((1 + np.sum(null_scores >= statistic)) / (1 + len(null_scores)))
-    rivals = sorted((k for k in ranking.statistic if k != name), key=lambda k: -ranking.statistic[k])[:4]
-    confusers = tuple(Confuser(k, s) for k in rivals if (s := separation(scanner, ranking, name, k)) is not None)
-    if step.points:
-        parameters = _point_parameters(scanner, estimate, step.points)
-        if "scale_spline" in members:
-            confusers = (Confuser("scale_spline", 0.0), *confusers)
-    else:
-        rows = [r for r in estimate.table() if r.effect == name]
-        # Of several steps, the one that stands `turn` from the last.
-        each = len(rows) // estimate.model.labels.count(name)
-        rows = rows[len(rows) - turn * each :][:each]
-        parameters = tuple(ParameterValue(r.name, r.value, r.std, r.unit) for r in rows)
-        if q == 1 and least <= statistic:
-            own = float(log_evidence_ratio(np.array(explained), result.rss, nu, 1))
-            price = min(max(own - statistic, 0.0), float(np.log(shapes)))
-            part = least_told(statistic, least, price, nu)
-            parameters = tuple(_told(p, step.effect, part) for p in parameters)
-        if isinstance(step.effect, BiasStep):
-            parameters = tuple(_dated(scanner, estimate, turn, g, p) for p in parameters)
-    return Cause(name, parameters, statistic, p, adjusted, members.get(name, 0.0), confusers, step.points)
-
-
-def _told(parameter: ParameterValue, effect: Effect | None, part: float) -> ParameterValue:
-    """The one coefficient of an effect with its interval, if at `part` of its size it would not have been told."""
-    if effect is None or parameter.name != effect.leading() or not parameter.std > 0.0:
-        return parameter
-    nothing = 1.0 if effect.site == "gain" else 0.0
-    z = (parameter.value - nothing) / parameter.std
-    low, high = (nothing + parameter.std * end for end in after_selection(z, part * abs(z)))
-    return replace(parameter, ci95=(low, high))
-
-
-def _dated(scanner: Scanner, estimate: Estimate, turn: int, g: int, parameter: ParameterValue) -> ParameterValue:
-    """The epoch of the step that stands `turn` from the last, with its interval; any other parameter as it is."""
-    if parameter.name != "epoch":
-        return parameter
-    own = [e for e in estimate.model.effects if isinstance(e, BiasStep)][-turn]
-    std, low, high = epoch_interval(scanner, estimate, own, g)
-    scale = factor("s", parameter.unit)
-    return replace(parameter, std=std * scale, ci95=(low * scale, high * scale))
-
-
-def _point_parameters(scanner: Scanner, estimate: Estimate, rows: tuple[int, ...]) -> tuple[ParameterValue, ...]:
-    record = scanner.record
-    predicted = np.asarray(estimate.model.predict(record.signals))
-    slope = np.asarray(estimate.model.slope(record.signals))
-    jacobian = np.asarray(estimate.model.linearise(record.signals)[1])
-    scale = factor("rad/s", "deg/s")
-    found = []
-    for p in scanner.points_among(rows):
-        shift = float(np.mean((np.asarray(record.signals["output"])[p] - predicted[p]) / slope[p]))
-        # Of the point and of the model, which was fitted without it.
-        of_model = np.mean(jacobian[p], axis=0)
-        variance = estimate.white_variance / len(p) + of_model @ estimate.covariance @ of_model
-        std = float(np.sqrt(variance) / np.mean(np.abs(slope[p])))
-        rate = float(record.signals["rate"][p[0]]) * scale if "rate" in record.signals else None
-        label = f"shift at {rate:.4g} deg/s" if rate is not None else f"shift at data row {p[0] + 1}"
-        found.append(ParameterValue(label, shift * scale, std * scale, "deg/s"))
-    return tuple(found)
