@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.signal import cont2discrete, lfilter
+from scipy.spatial.transform import Rotation
 
 import gyromodel
 from gyromodel.campaign import Campaign
@@ -226,6 +227,39 @@ def test_exact_confusions_are_told_of(design: str):
         assert np.linalg.norm(rates, axis=0) == pytest.approx(EARTH, rel=1e-4)
         force = np.array([campaign.columns[f"acceleration_{a}"] for a in ("input", "output", "spin")])
         assert np.sum(rates * force, axis=0) == pytest.approx(np.sum(before * force, axis=0), abs=1e-4 * EARTH)
+
+
+@pytest.fixture
+def gyrocompass(rng: np.random.Generator) -> Campaign:
+    """A gyro with a level axis at twelve azimuths, four means each, on a table that leans to the side by 0.02 rad."""
+    latitude, azimuth = 0.7, np.repeat(2 * np.pi * np.arange(12) / 12, 4)
+    earth = EARTH * np.array([0.0, np.cos(latitude), np.sin(latitude)])
+    north, lean = np.array([0.0, 1.0, 0.0]), 0.02
+    turned = Rotation.from_rotvec(-azimuth[:, None] * [0.0, 0.0, 1.0]).apply(north)
+    level, leaning = (Rotation.from_rotvec([0.0, angle, 0.0]).apply(turned) @ earth for angle in (0.0, lean))
+    output = leaning + np.deg2rad(1e-5) * rng.standard_normal(len(azimuth))
+    columns = {"time": 300.0 * np.arange(48), "azimuth": np.rad2deg(azimuth)}
+    columns |= {"rate": np.rad2deg(level), "output": np.rad2deg(output)}
+    units = {"time": "s", "azimuth": "deg", "rate": "deg/s", "output": "deg/s"}
+    return Campaign(columns, units, {"kind": "rate", "rate_frame": "inertial"})
+
+
+def test_a_tilt_that_the_rate_hides_in_part_is_searched_for_the_rest(gyrocompass: Campaign):
+    bank = build_bank(read_signals(gyrocompass))
+    assert "scale error" in bank.not_testable["part of table_tilt"]
+    assert [f.leading() for f in bank.forms("table_tilt")] == ["north", "east", "north"]
+    scaled = gyrocompass.with_column("rate", np.linspace(0, 1, 48), "deg/s")
+    assert "part of table_tilt" not in build_bank(read_signals(scaled)).not_testable
+
+
+@pytest.mark.long
+def test_a_tilt_of_a_gyrocompass(gyrocompass: Campaign):
+    found = gyromodel.diagnose(gyrocompass, model_from_effects(["scale_factor", "bias"]), hold_out=False)
+    assert (found.verdict, set(found.credible_set)) == ("ambiguous", {"table_tilt", "bias_magnetic"})
+    [part] = [p for c in found.causes for p in c.parameters]
+    assert part.name in ("east", "sine")
+    true = 0.02 * np.rad2deg(EARTH) * 3600 * np.sin(0.7)
+    assert abs(abs(part.value) - true) < 4 * part.std
 
 
 @pytest.mark.long

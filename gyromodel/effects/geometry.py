@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Iterable
-from typing import Self
+from typing import Any, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,6 +20,10 @@ from gyromodel.effects._base import Effect, Signals, parameter, stack
 
 # Harmonics of the table angle that are searched.
 HARMONICS = (1, 2, 3, 4)
+# A rate that differs from a sine of the azimuth by less than this part of itself is one.
+ALIKE = 1e-3
+# Of a cosine and a sine that are searched, which have an amplitude: both, or one, where the other is known otherwise.
+PARTS = tuple((jnp.zeros(cosine), jnp.zeros(sine)) for cosine, sine in ((1, 1), (1, 0), (0, 1)))
 
 
 def cross_rates(names: Iterable[str]) -> list[str]:
@@ -96,7 +100,8 @@ class TableTilt(Effect):
     """I += A_N cos Ψ + A_E sin Ψ, Ψ the azimuth: Earth's horizontal rate through a tilt.
 
     A tilt of the input axis by θ from the axis of the table, or of the table from the vertical, senses θ times the
-    Earth's horizontal rate, 15.04 deg/h · cos(latitude): the amplitudes over that rate are the tilt in radians.
+    Earth's horizontal rate, 15.04 deg/h · cos(latitude): the amplitudes over that rate are the tilt in radians. Either
+    part may have no entry: that which a rate given in inertial space follows is a scale error as well.
     """
 
     id = "table_tilt"
@@ -105,9 +110,12 @@ class TableTilt(Effect):
     cause = "The input axis or the table leans, and the Earth's horizontal rate enters as the gyro turns in azimuth."
     test = "Reverse the magnetic field around the gyro, or shield it: a tilt stays, a magnetic bias does not."
 
-    north: Float[Array, ""] = parameter("deg/h", 0.01, "part that follows the cosine of azimuth")
-    east: Float[Array, ""] = parameter("deg/h", 0.01, "part that follows the sine")
+    north: Float[Array, " n"] = parameter("deg/h", 0.01, "part that follows the cosine of azimuth", default=())
+    east: Float[Array, " e"] = parameter("deg/h", 0.01, "part that follows the sine", default=())
     angle: str = eqx.field(static=True, default="")
+
+    def __post_init__(self) -> None:
+        self.north, self.east = _two_parts(self.north, self.east)
 
     @property
     def columns_needed(self) -> tuple[str, ...]:
@@ -116,7 +124,7 @@ class TableTilt(Effect):
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """Cosine and sine of the azimuth."""
-        return stack(jnp.cos(signals[self.angle]), jnp.sin(signals[self.angle]))
+        return stack(*_waves(signals[self.angle], self.north, self.east))
 
     def prepared(self, signals: Signals) -> Self:
         """Take the azimuth; the table angle where there is none that varies."""
@@ -125,10 +133,15 @@ class TableTilt(Effect):
         return dataclasses.replace(self, angle=angle_column(signals, "azimuth", "table_angle"))
 
     @classmethod
+    def hidden(cls, signals: Signals) -> str:
+        """What follows the rate, too."""
+        return _as_the_rate(signals, cls().prepared(signals).angle)
+
+    @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
-        """The one angle, if it varies."""
-        effect = cls().prepared(signals)
-        return [effect] if varying(signals, [effect.angle]) else []
+        """Of the one angle, if it varies, both parts, and each."""
+        angle = cls().prepared(signals).angle
+        return [cls(n, e, angle) for n, e in PARTS] if varying(signals, [angle]) else []
 
 
 class TableHarmonic(Effect):
@@ -188,14 +201,14 @@ class BiasMagnetic(Effect):
     def __post_init__(self) -> None:
         if np.size(self.coefficients) == 0 and any(self.field):
             self.coefficients = jnp.zeros(len(self.field))
-        if np.size(self.cosine) == np.size(self.sine) == 0 and self.angle:
-            self.cosine = self.sine = jnp.zeros(1)
+        if self.angle:
+            self.cosine, self.sine = _two_parts(self.cosine, self.sine)
 
     def __check_init__(self) -> None:
         if self.coefficients.shape != (len(self.field) * any(self.field),):
             raise ValueError("field names one column for each coefficient")
-        if not self.cosine.shape == self.sine.shape == (bool(self.angle) * 1,):
-            raise ValueError("an angle needs a cosine and a sine")
+        if not self.angle and np.size(self.cosine) + np.size(self.sine):
+            raise ValueError("a cosine and a sine need an angle")
 
     @property
     def columns_needed(self) -> tuple[str, ...]:
@@ -204,10 +217,10 @@ class BiasMagnetic(Effect):
         return named or self.needs
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
-        """The components of the field, or cosine and sine of the angle."""
+        """The components of the field, and cosine and sine of the angle."""
         parts = [signals[n] for n in self.field if n]
         if self.angle:
-            parts += [jnp.cos(signals[self.angle]), jnp.sin(signals[self.angle])]
+            parts += _waves(signals[self.angle], self.cosine, self.sine)
         return stack(*parts) if parts else jnp.zeros((signals["time"].shape[0], 0))
 
     def prepared(self, signals: Signals) -> Self:
@@ -220,14 +233,43 @@ class BiasMagnetic(Effect):
         return type(self)(angle=angle_column(signals, "azimuth", "table_angle"))
 
     @classmethod
+    def hidden(cls, signals: Signals) -> str:
+        """What follows the rate, too."""
+        return _as_the_rate(signals, cls().prepared(signals).angle)
+
+    @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
-        """Each component of the field that varies, all of them, or the angle."""
+        """Each component of the field that varies, and all of them, or of the angle both parts, and each."""
         names = varying(signals, _field(signals))
         if names:
             sets = dict.fromkeys([*((n,) for n in names), tuple(names)])
             return [cls(field=s) for s in sets]
-        effect = cls().prepared(signals)
-        return [effect] if effect.angle and varying(signals, [effect.angle]) else []
+        angle = cls().prepared(signals).angle
+        return [cls(cosine=c, sine=s, angle=angle) for c, s in PARTS] if angle and varying(signals, [angle]) else []
+
+
+def _two_parts(*amplitudes: Any) -> list[Array]:
+    """Amplitudes of a cosine and a sine, one of each at most: of both, where none is given."""
+    if max(map(np.size, amplitudes)) > 1:
+        raise ValueError("there is one cosine and one sine at most")
+    given = any(map(np.size, amplitudes))
+    return [jnp.ravel(jnp.asarray(a if given else 0.0, float)) for a in amplitudes]
+
+
+def _waves(angle: Array, cosine: Array, sine: Array) -> list[Array]:
+    """The cosine and the sine of an angle, as far as they have amplitudes."""
+    return [jnp.cos(angle)] * jnp.size(cosine) + [jnp.sin(angle)] * jnp.size(sine)
+
+
+def _as_the_rate(signals: Signals, angle: str) -> str:
+    """Why a part of what follows an angle is not seen: the rate, as that of the Earth, does so as well."""
+    if not angle or "rate" not in signals:
+        return ""
+    rate, turned = np.asarray(signals["rate"]), np.asarray(signals[angle])
+    columns = np.stack([np.ones(len(rate)), np.cos(turned), np.sin(turned)], axis=1)
+    left = rate - columns @ np.linalg.lstsq(columns, rate)[0]
+    alike = np.std(rate) > 0.0 and np.std(left) < ALIKE * np.std(rate)
+    return "what of it follows the rate is a scale error as well: needs another latitude or rate" if alike else ""
 
 
 def _field(signals: Signals) -> list[str]:
