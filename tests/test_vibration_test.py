@@ -160,7 +160,11 @@ def test_the_embedded_log(demo: VibrationTest):
     best = demo.supported[0]
     assert best == "time offset, wet and dry friction, integration estimated, without axis Y"
     assert demo.left_out == ("Y",)
-    assert demo.supported == (best,)
+    # Of those that do not only add to it the next, a resonance in place of dry friction without Z, is e^-3 as likely.
+    first = demo.explanations[best]
+    more = [e for e in demo.explanations.values() if first.alternative.within(e.alternative) and e.left_out == ("Y",)]
+    rest = [e for e in demo.explanations.values() if e not in more]
+    assert min(e.criterion for e in rest) - first.criterion > 5.5
     values = {row.name: row.value for row in parameters(demo.explanations[best])}
     assert values["time offset"] == pytest.approx(2.0, abs=0.02)
     assert values["friction over inertia X"] == pytest.approx(0.5 / 0.45 * 210 / 220, rel=0.25)
@@ -171,7 +175,6 @@ def test_the_embedded_log(demo: VibrationTest):
 def test_the_series_of_the_embedded_log(demo: VibrationTest):
     """Friction of the redundant gimbal sticks, which overtones about Y tell; without Y the series hold the truth."""
     assert demo.series is not None
-    assert demo.sticking == ("Y",)
     assert demo.series.probability > 0.01
     rows = {row.name: row for row in parameters(demo.series)}
     inertia = {"X": 0.45, "Z": 0.56}
@@ -216,6 +219,9 @@ def test_an_isolator_is_no_time_offset(rng: np.random.Generator):
     likely = [name for name, e in explanations.items() if e.probability > 1e-6]
     assert all("resonance" in name or "loop estimated" in name for name in likely)
     right = explanations["resonance, damped"]
+    # What a loop's gain does besides costs more than it explains.
+    best = min(explanations.values(), key=lambda e: e.criterion)
+    assert right.criterion - best.criterion < 6.0
     assert right.probability > 1e-6
     assert explanations["time offset, resonance"].probability < 1e-6
     rows = {row.name: row for row in parameters(right)}
@@ -296,7 +302,8 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert re.findall(r"""(?:src|href)=["'](?!#)[^"']*|url\((?!#)[^)]*|@import""", page) == []
     assert page.count("<svg") == len(names)
     assert "time offset (1.9995" in page
-    assert page.count('<tr><th scope="row">') >= 12
+    runs = page[page.index('id="runs"') : page.index('id="explained"')]
+    assert runs.count('<tr><th scope="row">') == 12
 
 
 def test_the_command_prints_its_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -17,7 +17,7 @@ from gyromodel.estimate import EstimateError
 from gyromodel.platform._acceptance import AXES
 from gyromodel.platform._alternatives import ENTRIES, Alternative
 from gyromodel.platform._explanations import Explanation
-from gyromodel.platform._judgement import EXCLUDED, Judgement, explained, further, judged
+from gyromodel.platform._judgement import EXCLUDED, explained, further, judged
 from gyromodel.platform._loop import Loop
 from gyromodel.platform._motion import BaseMotion, base_motion
 from gyromodel.platform._responses import LEVEL, Response, responses
@@ -58,12 +58,13 @@ class VibrationTest:
         possible: explanations that are not excluded, not far behind, and add nothing but what is seen, best first.
         few: whether the runs are too few to name one: some of these are left too few degrees of freedom, or there is
             none whose numbers are determined.
+        held: whether the angles, overtones included, hold the possible ones too; where they hold none, nothing offered
+            explains the runs.
         further: of further tests of all axes, the least separation of any two of the first possible ones, in standard
             deviations.
         crossover: of the loop, where the runs determine it beside the rest of the first possible one.
         histories: of one run of each axis.
         series: the first supported one fitted to the angles themselves, overtones included, where they determine it.
-        sticking: axes that this fit leaves out, as overtones exclude it with them, the one left out before included.
     """
 
     responses: tuple[Response, ...]
@@ -73,11 +74,11 @@ class VibrationTest:
     scatter_stated: bool
     possible: tuple[str, ...]
     few: bool
+    held: bool
     further: dict[str, float]
     crossover: Row | None = None
     histories: dict[str, History] = field(default_factory=dict, repr=False)
     series: Explanation | None = field(default=None, repr=False)
-    sticking: tuple[str, ...] = ()
 
     @property
     def supported(self) -> tuple[str, ...]:
@@ -90,9 +91,15 @@ class VibrationTest:
         return self.explanations[self.possible[0]] if self.possible else None
 
     @property
+    def firm(self) -> bool:
+        """Whether one explanation alone is supported, by the runs' own errors and by the angles."""
+        return len(self.supported) == 1 and self.scatter_stated and self.held
+
+    @property
     def left_out(self) -> tuple[str, ...]:
-        """Axes that the best explanation leaves out."""
-        return self.best.left_out if self.best else ()
+        """Axes that every supported explanation leaves out."""
+        outs = {self.explanations[name].left_out for name in self.supported}
+        return outs.pop() if len(outs) == 1 else ()
 
     @property
     def next_test(self) -> str | None:
@@ -130,13 +137,13 @@ class VibrationTest:
             "supported": list(self.supported),
             "possible": list(self.possible),
             "too_few_runs": self.few,
+            "firm": self.firm,
             "crossover": self.crossover and self.crossover._asdict(),
             "further_tests": self.further,
             "next_test": self.next_test,
             "series": self.series
             and {
                 "probability": self.series.probability,
-                "axes_left_out": list(self.sticking),
                 "parameters": [row._asdict() for row in parameters(self.series)],
             },
         }
@@ -159,7 +166,7 @@ def parameters(found: Explanation) -> list[Row]:
     inertia = float(Loop().inertia)
     units = {"offset": (1e3, "ms"), "friction": (1 / inertia, "1/s"), "lag": (1e3, "ms")}
     units |= {"corner": (1.0, "rad/s"), "crossover": (1.0, "rad/s")}
-    units |= {"compliance": (1e6, "1e-6 s^2"), "dry friction": (1 / inertia, "rad/s^2")}
+    units |= {"compliance": (1e6, "ms^2"), "dry friction": (1 / inertia, "rad/s^2")}
     same = "offset" in found.alternative.kinds
     for name, value, std in zip(ENTRIES, found.value, found.std, strict=True):
         kind, axis = (name[:-2], name[-1]) if name[-1] in AXES else (name, "")
@@ -197,10 +204,18 @@ def vibration_test(campaign: Campaign, progress: Callable[[str, float], None] | 
         raise CampaignError(f"{campaign.name}: no run has a vibration: {listed(remarks)}")
     integrated = any(name.startswith("output_") for name in campaign.columns)
     tell("explaining", 0.3)
-    verdict = judged(found, integrated)
+    fits: dict[Explanation, Explanation | None] = {}
+
+    def by_angles(e: Explanation) -> Explanation | None:
+        if e not in fits:
+            fits[e] = _of_series(motion, [r for r in found if r.axis not in e.left_out], e, integrated)
+        return fits[e]
+
+    def holds(e: Explanation) -> bool:
+        return (fit := by_angles(e)) is None or fit.probability >= EXCLUDED
+
+    verdict = judged(found, integrated, holds)
     possible = [verdict.explanations[name] for name in verdict.possible]
-    tell("fitting the series", 0.6)
-    series, sticking = _of_series(motion, found, verdict, integrated)
     tell("looking for further tests", 0.8)
     return VibrationTest(
         responses=tuple(found),
@@ -210,11 +225,11 @@ def vibration_test(campaign: Campaign, progress: Callable[[str, float], None] | 
         scatter_stated=verdict.stated,
         possible=verdict.possible,
         few=verdict.few,
+        held=verdict.held,
         further=further(possible, found, integrated),
         crossover=None if verdict.few else _crossover(possible[0], found, integrated, verdict.stated),
         histories=_histories(motion, found),
-        series=series,
-        sticking=sticking,
+        series=None if verdict.few else by_angles(possible[0]),
     )
 
 
@@ -229,23 +244,11 @@ def _crossover(best: Explanation, found: list[Response], integrated: bool, known
     return None
 
 
-def _of_series(
-    motion: BaseMotion, found: list[Response], verdict: Judgement, integrated: bool
-) -> tuple[Explanation | None, tuple[str, ...]]:
-    """The fit of the series, without one more axis where all together exclude it and the others do not."""
-    if verdict.few:
-        return None, ()
-    best = verdict.explanations[verdict.possible[0]]
-    axes = sorted({r.axis for r in found} - set(best.left_out))
-    fits: list[tuple[Explanation, tuple[str, ...]]] = []
-    for more in [(), *((axis,) for axis in axes if len(axes) > 1)]:
-        left_out = best.left_out + more
-        with suppress(EstimateError):
-            runs = [r for r in found if r.axis not in left_out]
-            fits.append((fit_series(motion, runs, best.alternative, integrated, best.value), left_out))
-        if not more and fits and fits[0][0].probability >= EXCLUDED:
-            break
-    return max(fits, key=lambda fit: fit[0].probability, default=(None, best.left_out))
+def _of_series(motion: BaseMotion, runs: list[Response], found: Explanation, integrated: bool) -> Explanation | None:
+    """An explanation fitted to the angles of some runs, where they determine it."""
+    with suppress(EstimateError):
+        return fit_series(motion, runs, found.alternative, integrated, found.value)
+    return None
 
 
 def _histories(motion: BaseMotion, found: list[Response]) -> dict[str, History]:

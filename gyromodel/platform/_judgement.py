@@ -1,12 +1,13 @@
 """Which explanations a logged vibration test supports, and which further test would tell those apart.
 
-All compete by one number, Akaike's criterion: also those that leave an axis out, as a shaft that sticks makes one that
-nothing here describes. Each number left out counts as a parameter that takes it up.
+All compete by one number, Akaike's criterion, as far as the angles themselves do not exclude them. Where few or none of
+them hold, those that leave an axis out compete too, as a shaft that sticks makes one that nothing here describes: each
+number left out counts as a parameter that takes it up.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations
@@ -24,8 +25,8 @@ from gyromodel.platform._responses import Response
 KINDS = {kind: [i for i, name in enumerate(ENTRIES) if name.rstrip(" XYZ") == kind]
          for kind in ("offset", "friction", "dry friction", "compliance", "lag", "corner", "crossover")}  # fmt: skip
 # Below this probability of its sum of squares an explanation is excluded, and below this of the best of them axes are
-# left out as well.
-EXCLUDED, DOUBTED = 0.01, 0.05
+# left out as well; they are, too, where the angles exclude all.
+EXCLUDED, DOUBTED = 1e-3, 0.05
 # Akaike's criterion above the best up to which an explanation is supported: one twentieth as likely.
 SUPPORTED = 6.0
 # Degrees of freedom that a supported explanation has at least: four runs fit what is wrong as well.
@@ -40,36 +41,47 @@ class Judgement(NamedTuple):
 
     explanations: by name, best first; stated: whether the responses' own standard errors judged them; possible: those
     that are not excluded, not far behind and add nothing but what is seen, best first; few: whether one of these is
-    left too few degrees of freedom, or the numbers of none are determined.
+    left too few degrees of freedom, or the numbers of none are determined; held: whether the angles hold them too.
     """
 
     explanations: dict[str, Explanation]
     stated: bool
     possible: tuple[str, ...]
     few: bool
+    held: bool
 
 
-def judged(found: list[Response], integrated: bool) -> Judgement:
-    """Fit and compare everything that is offered."""
+def judged(found: list[Response], integrated: bool, holds: Callable[[Explanation], bool] = lambda e: True) -> Judgement:
+    """Fit and compare everything that is offered; `holds`: whether the angles of the runs do not exclude it."""
     axes = sorted({r.axis for r in found})
     explanations = _explained(found, integrated)
-    if _likeliest(explanations.values()) < DOUBTED and len(axes) > 1:
+    possible = _possible(explanations, EXCLUDED, holds)
+    if len(axes) > 1 and (not possible or _likeliest(explanations.values()) < DOUBTED):
         for axis in axes:
             others = _explained(found, integrated, (axis,)).items()
             explanations |= {f"{n}, without axis {axis}": e for n, e in others if e.probability >= EXCLUDED}
-    stated = _likeliest(explanations.values()) >= EXCLUDED
+        possible = _possible(explanations, EXCLUDED, holds)
+    stated, held = _likeliest(explanations.values()) >= EXCLUDED, bool(possible)
     if not stated:
         explanations = _explained(found, integrated, known=False)
+    possible = possible or _possible(explanations, EXCLUDED if stated else 0.0)
+    few = not possible or any(explanations[name].degrees_of_freedom < LEAST_FREEDOM for name in possible)
     explanations = dict(sorted(explanations.items(), key=lambda item: item[1].criterion))
-    passing = {name: e for name, e in explanations.items() if not (stated and e.probability < EXCLUDED)}
-    best = min((e.criterion for e in passing.values()), default=0.0)
-    possible: dict[str, Explanation] = {}
-    for name, e in passing.items():
-        near = e.criterion - best <= SUPPORTED
-        if near and _sized(e) and not any(_within(smaller, e) for smaller in possible.values()):
-            possible[name] = e
-    few = not possible or any(e.degrees_of_freedom < LEAST_FREEDOM for e in possible.values())
-    return Judgement(explanations, stated, tuple(possible), few)
+    return Judgement(explanations, stated, tuple(possible), few, held)
+
+
+def _possible(
+    explanations: dict[str, Explanation], least: float, holds: Callable[[Explanation], bool] = lambda e: True
+) -> list[str]:
+    """Those of some probability that hold, nearly as good as the best of them, that add nothing but what is seen."""
+    chosen: dict[str, Explanation] = {}
+    for name, e in sorted(explanations.items(), key=lambda item: item[1].criterion):
+        best = min((other.criterion for other in chosen.values()), default=e.criterion)
+        if e.probability < least or e.criterion - best > SUPPORTED or not _sized(e):
+            continue
+        if not any(_within(smaller, e) for smaller in chosen.values()) and holds(e):
+            chosen[name] = e
+    return list(chosen)
 
 
 def _likeliest(explanations: Iterable[Explanation]) -> float:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from gyromodel.platform import EXCLUDED, parameters
 from gyromodel.report._numbers import number, with_uncertainty
 from gyromodel.report._page import filled
-from gyromodel.report._vibration_words import explained_lines, notes, vibration_sentence, vibration_words
+from gyromodel.report._vibration_words import explained, notes, vibration_sentence, vibration_words
 
 if TYPE_CHECKING:
     from gyromodel.platform import VibrationTest
@@ -40,11 +40,12 @@ _CAPTIONS = {
 def vibration_page(test: VibrationTest, figures: Mapping[str, str], campaign: str) -> str:
     """The page: a sentence, figures (SVG by name), responses, explanations, the next test, and what was noticed."""
     words = vibration_words(test)
-    verdict, badge = ("unknown", "Too few runs") if test.few else ("ambiguous", "Several explanations")
-    if len(test.supported) == 1:
+    verdict, badge = ("unknown", "Too few runs") if test.few else ("unknown", "Not explained")
+    if test.firm:
         verdict, badge = "named", "Explained"
-    *lines, last = explained_lines(test)
-    further = test.next_test is not None or len(test.possible) > 1
+    elif len(test.supported) > 1 and test.scatter_stated and test.held:
+        verdict, badge = "ambiguous", "Several explanations"
+    told = explained(test)
     return filled(
         "vibration.html",
         {
@@ -56,9 +57,9 @@ def vibration_page(test: VibrationTest, figures: Mapping[str, str], campaign: st
             "runs": words.runs,
             "notes": notes(test),
             "rows": _rows(test),
-            # What is listed there is the table here.
-            "lines": [line for line in (lines if further else [*lines, last]) if line[:2] != "- " and line[-1] != ":"],
-            "next_test": last.removeprefix("Next test: ").capitalize() if test.few else (last if further else None),
+            "lead": told.lead,
+            "lines": told.rest,
+            "next_test": told.next,
             "findings": test.remarks,
             "figures": figures,
             "captions": _CAPTIONS,
@@ -75,7 +76,7 @@ def _rows(test: VibrationTest) -> list[dict[str, Any]]:
         excluded = test.scatter_stated and e.probability < EXCLUDED
         verdict = "excluded" if excluded else "not needed, undetermined or less likely"
         if name in test.possible:
-            verdict = "possible" if test.few or len(test.possible) > 1 else "supported"
+            verdict = "supported" if test.firm else "possible"
         rows.append(
             {
                 "name": name,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 from gyromodel._checks import listed
-from gyromodel.platform import EXCLUDED, assumed_loop, margins, parameters
+from gyromodel.platform import assumed_loop, margins, parameters
 from gyromodel.report._numbers import with_uncertainty
 
 if TYPE_CHECKING:
@@ -27,7 +27,9 @@ def vibration_words(test: VibrationTest) -> Words:
     """What a terminal shows."""
     head = ("run", "axis", "rad/s", "dB", "", "deg", "", "arccos, deg", "cross axes, %")
     remarks = [f"Note: {remark}." for remark in test.remarks]
-    lines = [*notes(test), *remarks, "", *explained_lines(test)]
+    told = explained(test)
+    lines = [*notes(test), *remarks, "", *told.lead, *(f"- {item}" for item in told.items), *told.rest]
+    lines += [f"Next test: {told.next}"] if told.next else []
     return Words(head, [_run(response) for response in test.responses], lines)
 
 
@@ -62,7 +64,9 @@ def vibration_sentence(test: VibrationTest) -> str:
         limits = f"{count}, all within the limits where these are published"
     if test.few:
         return f"{limits}; they are too few to name what explains them."
-    if len(test.supported) > 1:
+    if not (test.scatter_stated and test.held):
+        return f"{limits}; nothing that is offered explains them within their errors."
+    if not test.firm:
         return f"{limits}; {len(test.supported)} explanations of them cannot be told apart."
     name = test.possible[0]
     rows = parameters(test.explanations[name])[:1]
@@ -79,48 +83,54 @@ def notes(test: VibrationTest) -> list[str]:
     ]
 
 
-def explained_lines(test: VibrationTest) -> list[str]:
-    """What explains the runs together, what of the loop they tell, and which test would tell more."""
+class Explained(NamedTuple):
+    """What explains the runs together: sentences, explanations, sentences on them, and which test would tell more."""
+
+    lead: list[str]
+    items: list[str]
+    rest: list[str]
+    next: str | None
+
+
+def explained(test: VibrationTest) -> Explained:
+    """In words."""
     if not test.possible:
-        return ["The runs are too few to explain them together.", _next(test)]
-    judged = "the standard errors above" if test.scatter_stated else "the scatter each leaves"
-    excluded = "" if test.scatter_stated else " (the standard errors above exclude every explanation offered here)"
-    outs = {test.explanations[name].left_out for name in test.possible}
-    lines = []
-    if outs == {test.left_out} and test.left_out:
-        lines.append(
-            f"Axis {test.left_out[0]} is left out below: with it the standard errors above exclude what is offered "
-            "here, or make it far less likely. A shaft that sticks makes such an axis."
+        lead = ["The runs determine no explanation that they do not exclude."]
+        return Explained(lead, [], [], f"{test.next_test}.".capitalize())
+    lead = []
+    if test.left_out:
+        lead.append(
+            f"Axis {test.left_out[0]} is left out below: with it what is offered here is excluded by the standard "
+            "errors above or by the angles, or far less likely. A shaft that sticks makes such an axis."
         )
-    elif len(outs) > 1:
-        lines.append("Which axis, if any, is to be left out, as one that sticks is, these runs do not tell.")
-    if test.few:
-        lines.append(f"The runs are too few to name one explanation. These would do, judged by {judged}{excluded}:")
-    else:
-        runs = "the other runs" if outs == {test.left_out} and test.left_out else "all runs"
-        lines.append(f"What explains {runs}, judged by {judged}{excluded}:")
+    elif len({test.explanations[name].left_out for name in test.possible}) > 1:
+        lead.append("Which axis, if any, is to be left out, as one that sticks is, these runs do not tell.")
+    judged = "the standard errors above" if test.scatter_stated else "the scatter each leaves"
+    if not test.scatter_stated:
+        lead.append("The standard errors above exclude every explanation offered here.")
+    elif not test.held:
+        lead.append("The angles, overtones included, exclude what the standard errors do not: something sticks.")
+    which = "The runs are too few to name one explanation. These would do" if test.few else "What comes nearest"
+    if test.scatter_stated and test.held and not test.few:
+        which = f"What explains {'the other' if test.left_out else 'all'} runs"
+    lead.append(f"{which}, judged by {judged}:")
     shown = test.possible[:_SHOWN]
-    lines += [f"- {name}: {_values(test.explanations[name])}." for name in shown]
-    rest = len(test.explanations) - len(shown)
-    lines.append(
-        f"{rest} others are {'excluded, ' if test.scatter_stated else ''}far less likely, or only add to these what is "
-        "not seen (vibration.json)."
+    items = [f"{name}: {_values(test.explanations[name])}." for name in shown]
+    others = (
+        f"{len(test.explanations) - len(shown)} others are {'excluded, ' if test.scatter_stated else ''}less likely"
     )
-    if test.series is not None:
-        axes = [axis for axis in test.sticking if axis not in test.left_out]
-        without = f", without axis {listed(axes)}, where something sticks" if axes else ""
-        if test.series.probability < EXCLUDED:
-            lines.append("Overtones in the angles exclude the first of these: something sticks, or is not of one size.")
-        else:
-            lines.append(f"The first from the angles themselves, overtones included{without}: {_values(test.series)}.")
-    lines += loop_lines(test)
-    return [*lines, *([_next(test)] if len(test.possible) > 1 or test.few else [])]
+    rest = [f"{others}, or only add to these what is not seen (vibration.json)."]
+    if test.series is not None and test.held:
+        rest.append(f"The first from the angles themselves, overtones included: {_values(test.series)}.")
+    return Explained(lead, items, rest + loop_lines(test), _next(test) if len(test.possible) > 1 or test.few else None)
 
 
 def loop_lines(test: VibrationTest) -> list[str]:
     """What of the loop the runs determine, and what is assumed."""
     best = test.best
-    if best is None or "friction" not in best.alternative.kinds:
+    if best is None or test.few:
+        return []
+    if not any("friction" in test.explanations[name].alternative.kinds for name in test.possible):
         return ["No friction shows, and without it nothing of the loop does."]
     known = (
         "Angles tell a loop's friction and gain over its inertia, c/J and K/J; J itself takes a torque or an inertia "
@@ -130,17 +140,17 @@ def loop_lines(test: VibrationTest) -> list[str]:
         crossover = with_uncertainty(test.crossover.value, test.crossover.std, test.crossover.unit)
         fitted = "" if "crossover" in best.alternative.kinds else " where it is fitted besides"
         return [f"The loop's crossover is {crossover}{fitted}; its lags are assumed.", known]
-    assumed = f"{margins(assumed_loop(best)).crossover:.0f} rad/s"
     return [
-        f"The loop's crossover is not determined by these runs: {assumed} is assumed, and friction over inertia goes "
-        "with it. Runs up to the crossover would tell it.",
+        f"The loop's gain is not determined by these runs: it is assumed, which puts the crossover at "
+        f"{margins(assumed_loop(best)).crossover:.0f} rad/s, and friction over inertia goes with it. Runs up to the "
+        "crossover would tell it.",
         known,
     ]
 
 
 def _next(test: VibrationTest) -> str:
     if test.few:
-        return f"Next test: {test.next_test}."
+        return f"{test.next_test}.".capitalize()
     if test.next_test:
         apart = f"{test.further[test.next_test]:.1f} standard deviations apart (3.3 are enough)"
         return f"These cannot be told apart. One more test, {test.next_test}, all axes, sets them {apart}."

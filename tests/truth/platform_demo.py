@@ -30,11 +30,11 @@ DESIGN = Platform(
 )
 
 
-def demo_log() -> Campaign:
-    """Twelve runs of 14 s: X, Y and Z at 1, 10, 20 and 30 rad/s, 0.15 deg."""
+def demo_log(seed: int = 1) -> Campaign:
+    """Twelve runs of 14 s: X, Y and Z at 1, 10, 20 and 30 rad/s, 0.15 deg; `seed` of the noise."""
     amplitude = np.deg2rad(0.15) * np.repeat(np.eye(3), 4, axis=0)
     frequency = np.tile(FREQUENCIES, 3)[:, None] * np.ones(3)
-    log = vibration_test(DESIGN, amplitude, frequency, 15.0, skip=1.0, seed=1)
+    log = vibration_test(DESIGN, amplitude, frequency, 15.0, skip=1.0, seed=seed)
     for name in log.columns:
         log = log.with_column(name, np.round(log.columns[name], DIGITS), log.units[name])
     return log.with_metadata({"test": "angular vibration, simulated"})
