@@ -1,0 +1,362 @@
+"""The page of the hidden-effect study: levels with their intervals, checks, other methods, figures, and all misses."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from scipy.stats import binomtest
+
+from benchmarks._kept import Kept
+from tests.truth import levels, study
+from tests.truth.campaigns import HOMES, MOTION, TESTABLE, known
+from tests.truth.verdicts import allowed
+
+# In multiples of the minimal detectable size.
+SIZES = (0.5, 1.0, 2.0, 3.0, 10.0)
+# Channels that a campaign measures, of those that unknown effects follow.
+MEASURED = ("temperature", "rate", "supply_voltage", "pressure")
+TIMED_DRAWS = 2000  # of the calibration of a diagnosis that is timed
+HEAD = [
+    "| row | measure | prototype | must | measured (95 % interval) | n | | goal |",
+    "|---|---|---|---|---|---|---|---|",
+]
+
+
+def write_page(output: Path, whole: list[Kept]) -> None:
+    """Make the page of the kept parts of whole studies, by seed, and its figures beside it."""
+    parts = {label: [r for k in whole for r in k.parts[label]] for label in whole[0].parts}
+    nulls, outside = parts["nothing"] + parts["nothing, moving"], parts["nothing, outside"]
+    sized = {size: parts[f"effects {size:g}"] + parts[f"effects {size:g}, white"] for size in SIZES}
+    unknown = {size: parts[f"unknown {size:g}"] for size in (3.0, 10.0)}
+    main_sizes = [r for size in (1.0, 3.0, 10.0) for r in sized[size]]
+    uncatalogued = [r for records in unknown.values() for r in records]
+    reached = levels.null_levels(nulls + outside) + levels.effect_levels(main_sizes)
+    reached += levels.outside_levels(parts["effects 3, outside"])
+    reached += levels.unknown_levels(uncatalogued) + levels.pair_levels(parts["pairs"])
+    reached += levels.amplitude_levels(main_sizes) + levels.ambiguity_levels(parts["inseparable"], parts["drifts"])
+    reached += [levels.settled_level(parts["inseparable"]), levels.noise_level(nulls)]
+    reached += [levels.adequacy_level(sized[3.0]), levels.claim_level(parts["forced"])]
+    reached += levels.gain_coverage(sized[3.0])
+    reached.sort(key=lambda v: (float(v.row.rstrip("+")), v.measure))
+    uniform, lowest, count = levels.uniform_p_values(parts["calibrated"])
+    size, error = levels.mean_set_size(sized[3.0])
+    at_three = sum(r.isolable for r in sized[3.0])
+    controls, control_checks = _controls(nulls, sized[3.0], unknown[3.0])
+    tenth = binomtest(round(lowest * count), count, 0.1).pvalue > 0.05
+    small, three = size - 1.96 * error <= levels.SET_SIZE, f"{size:.2f} ± {error:.2f}"
+    mutants, mutant_checks = _mutants(parts)
+    checks = [
+        _check("3", "p-values uniform: Kolmogorov-Smirnov", "p > 0.01", f"p = {uniform:.2g}", count, uniform > 0.01),
+        _check("3", "p-values in the lowest tenth", "10 %", f"{100 * lowest:.1f} %", count, tenth),
+        _check("7", "mean size of the 95 % set, isolable, 3×", f"≤ {levels.SET_SIZE}", three, at_three, small),
+        _spent(whole[-1].seconds),
+        *(_leak(sized[s], s) for s in (1.0, 3.0)),
+        _bound(sized[1.0]),
+        *control_checks,
+        *mutant_checks,
+    ]
+    figures = {k: output.with_name(f"{output.stem}_{k}.png") for k in ("confusion", "power")}
+    commands = [f"    python -m benchmarks.discovery --seed {k.path.stem[5:-5]} --scale {k.scale:g}" for k in whole]
+    made = ", ".join(dict.fromkeys(k.code for k in whole))
+    lines = [
+        "# Hidden-effect study",
+        "",
+        f"{sum(map(len, parts.values()))} campaigns, by the engine {made} (a digest: `benchmarks/_kept.py`). Made by",
+        "",
+        *commands,
+        "",
+        "Sizes are multiples of the minimal detectable size, by a dense oracle that knows the noise, but no larger",
+        "than the physics allows. A level is met by the measured share, open where it is not and the 95 %",
+        "Clopper-Pearson interval does not exclude it: few campaigns (n) leave much open. 5+",
+        "counts every effect, isolable or not; confusions that nothing can resolve are accepted",
+        "(`tests/truth/verdicts.py`). Row 4 leaves out designs where the oracle has but one name to choose; rows 4 and",
+        "5 leave out drift, step and warm-up, which noise imitates. Row 15 is of the best candidate added whatever its",
+        "evidence, and its coverage of designs without positions. Nulls, unknown effects and effects in coloured noise",
+        "are diagnosed without hold-out. All noise is simulated, and unknown effects and pairs are hidden in three",
+        "designs only, at rest or on a rate table. Row 11 has [a page of its own](isolability.md), and noise of real",
+        "gyros [another](real_noise.md).",
+        "",
+        f"Never hidden here: {', '.join(_never_hidden())}.",
+        "",
+        *HEAD,
+        *map(_row, reached),
+        "",
+        "## Checks of the study and of single numbers",
+        "",
+        *HEAD,
+        *checks,
+        "",
+        "## Other methods on the same campaigns",
+        "",
+        *controls,
+        "",
+        "## Safeguards switched off",
+        "",
+        *mutants,
+        "",
+        "## Power, and p-values with nothing hidden",
+        "",
+        f"![share named over size; p-values against uniform]({figures['power'].name})",
+        "",
+        "## What is said of what was hidden, at 3×",
+        "",
+        f"![confusion matrix]({figures['confusion'].name})",
+        "",
+        *_missed([
+            r for label, records in parts.items() for r in records
+            if label.startswith(("nothing", "unknown", "pairs", "inseparable", "drifts", "effects 3", "effects 10"))
+        ]),
+    ]  # fmt: skip
+    output.parent.mkdir(parents=True, exist_ok=True)
+    output.write_text("\n".join(lines), encoding="utf-8")
+    _confusion(sized[3.0] + unknown[3.0], figures["confusion"])
+    p_values = np.array([r.answer.p_value for r in parts["calibrated"] if r.answer])
+    _curves([r for records in sized.values() for r in records], p_values, figures["power"])
+
+
+def _row(v: levels.Level) -> str:
+    low, high = v.interval
+    must = f"{'≥' if v.at_least else '≤'} {100 * v.must:.1f} %"
+    measured = f"{100 * v.share:.1f} % ({100 * low:.1f}-{100 * high:.1f})"
+    verdict = v.verdict.replace("missed", "**missed**")
+    wanted = f"{100 * w.must:.1f} %: {w.verdict}" if (w := v.wanted) else "–"
+    return f"| {v.row} | {v.measure} | {v.prototype} | {must} | {measured} | {v.total} | {verdict} | {wanted} |"
+
+
+def _check(row: str, measure: str, must: str, measured: str, count: int, met: Any) -> str:
+    return f"| {row} | {measure} | – | {must} | {measured} | {count} | {'met' if met else '**missed**'} | |"
+
+
+def _right(name: str, record: study.Record) -> bool:
+    """Whether one name is right, by the rule that every method is judged by."""
+    return name in allowed(str(record.case.effect), record.case.design)[0]
+
+
+def _driver(record: study.Record) -> str:
+    return " and ".join(record.truth.driver or ())
+
+
+def _controls(
+    nulls: list[study.Record], effects: list[study.Record], unknown: list[study.Record]
+) -> tuple[list[str], list[str]]:
+    """What each control and practitioner's method says at 3 x MDE, and the engine against shuffled truths.
+
+    Drivers are asked for where they are a measured column: the other methods know no derived ones and no pairs.
+    Returns the table, and the checks of what controls must do.
+    """
+    truths = [r.case.effect for r in effects]
+    most = Counter(truths).most_common(1)[0][0]
+    unknown = [r for r in unknown if _driver(r) in MEASURED]
+    lines = [
+        f"| method | extension with nothing hidden (n = {len(nulls)}) | exact name, 3× (n = {len(effects)}) | "
+        f"measured column of an unknown effect, 3× (n = {len(unknown)}) |",
+        "|---|---|---|---|",
+    ]
+    checks = []
+
+    def line(name: str, false: float, exact: float, driver: float, bold: str = "") -> None:
+        cells = " | ".join(f"{bold}{100 * share:.1f} %{bold}" for share in (false, exact, driver))
+        lines.append(f"| {bold}{name}{bold} | {cells} |")
+
+    def fails(name: str, false: float, exact: float) -> None:
+        shares, far = f"{100 * false:.0f} %, {100 * exact:.0f} %", false > 0.10 or exact < 0.75
+        must = "> 10 % or < 75 %"
+        checks.append(_check("1, 5", f"{name} fails: false extension, name", must, shares, len(nulls), far))
+
+    for name in study.CONTROLS if nulls[0].controls else ():
+        added = [(r, r.controls[name].added) for r in effects]
+        false = float(np.mean([bool(r.controls[name].added) for r in nulls]))
+        exact = float(np.mean([len(names) == 1 and _right(names[0], r) for r, names in added]))
+        driver = float(np.mean([r.controls[name].added == (f"smooth({_driver(r)})",) for r in unknown]))
+        line(name.replace("_", " "), false, exact, driver)
+        fails(name.replace("_", " "), false, exact)
+    share = float(np.mean([t == most for t in truths]))
+    line("always none", 0.0, 0.0, 0.0)
+    line(f"most frequent name ({most})", 1.0, share, 0.0)
+    fails("always none", 0.0, 0.0)
+    fails("most frequent name", 1.0, share)
+    lines.append(
+        "| oracle: noise and size known, an effect is there | – | "
+        f"{100 * np.mean([levels.oracle_right(r) for r in effects]):.1f} % | – |"
+    )
+    line(
+        "gyromodel",
+        float(np.mean([s.detected for r in nulls if (s := r.score)])),
+        float(np.mean([s.named for r in effects if (s := r.score)])),
+        float(np.mean([s.driver_right for r in unknown if (s := r.score)])),
+        "**",
+    )
+    shuffled = random.Random(0).sample(truths, len(truths))
+    hits = sum(r.answer is not None and r.answer.causes == (t,) for r, t in zip(effects, shuffled, strict=True))
+    measured, chance = (
+        f"{100 * hits / len(truths):.1f} %",
+        sum((n / len(truths)) ** 2 for n in Counter(truths).values()),
+    )
+    lines.append(f"| gyromodel against shuffled truths | – | {measured} | – |")
+    fair = bool(binomtest(hits, len(truths), chance, alternative="greater").pvalue > 0.01)
+    must = f"≤ {100 * chance:.1f} %"
+    checks.append(_check("5", "shuffled truths give chance", must, measured, len(truths), fair))
+    return lines, checks
+
+
+def _leak(records: list[study.Record], size: float) -> str:
+    """The oracle bounds row 4: an engine that is right much oftener where the two differ has seen the truth."""
+    engine, oracle = levels.surpassed(records)
+    fair = engine + oracle == 0 or binomtest(engine, engine + oracle, 0.5, alternative="greater").pvalue > 0.01
+    measured = f"{engine} against {oracle}"
+    return _check("4", f"first name right where the oracle's is not, and the reverse: no leak, {size:g}×", "not more",
+                  measured, len(records), bool(fair))  # fmt: skip
+
+
+def _bound(records: list[study.Record]) -> str:
+    """Row 5 of an oracle that knows noise and size, and needs as much evidence and as large a share as the engine."""
+    named, count = levels.oracle_names(records)
+    measure = "what bounds it: named by the oracle as firmly, 1×"
+    return f"| 5 | {measure} | – | – | {100 * named / max(count, 1):.1f} % | {count} | – | |"
+
+
+def _mutants(parts: dict[str, list[study.Record]]) -> tuple[list[str], list[str]]:
+    """Rows 1, 5 and 15 with a safeguard off, beside the same campaigns with it on: the table, and that each breaks."""
+    lines, checks = ["| switched off | measure | with it | without |", "|---|---|---|---|"], []
+    measures = {
+        "1": ("extension with nothing hidden", 0.02, False, "detected"),
+        "5": ("named, 3×", 0.92, True, "named"),
+        "15": ("held-out score rises with the best candidate, nothing hidden", 0.5, False, "gain_shown"),
+    }
+    for off, row, on, mutant in (
+        ("whitening", "1", "broken", "no_whitening"),
+        ("price of the search", "1", "broken", "no_look_elsewhere"),
+        ("projection", "5", "unbroken", "no_projection"),
+        ("nesting", "15", "forced", "forced_no_nesting"),
+    ):
+        measure, must, at_least, flag = measures[row]
+        both = []
+        for label in (on, mutant):
+            flags = [getattr(r.score, flag) for r in parts[label]]
+            both.append(levels.Level(row, measure, "", must, at_least, sum(flags), len(flags)))
+        lines.append(f"| {off} | {measure} | {100 * both[0].share:.0f} % | {100 * both[1].share:.0f} % |")
+        broken, share = both[1].verdict == "missed", f"{100 * both[1].share:.1f} %"
+        checks.append(_check(row, f"without {off}: {measure}", "fails the row", share, both[1].total, broken))
+    return lines, checks
+
+
+def _spent(seconds: Sequence[tuple[str, int, float]]) -> str:
+    """Row 18 of what was timed."""
+    each = ", ".join(f"{name} ({rows} rows) {spent:.0f}" for name, rows, spent in seconds)
+    most = max(spent for _, _, spent in seconds)
+    measure = f"processor seconds with {TIMED_DRAWS} draws and hold-out, the longest: {each}"
+    return _check("18", measure, "≤ 60 s", f"{most:.0f} s", len(seconds), most <= 60.0)
+
+
+def _never_hidden() -> list[str]:
+    """Catalogue effects of a gyro that the study does not hide."""
+    from gyromodel.declarations import declarations
+
+    hidden = {e for d in (*HOMES, *MOTION, "static_ramp") for e in TESTABLE[d]}
+    return sorted({e for e, of in declarations().items() if of.domain == "gyro"} - hidden - {"bias_column"})
+
+
+def _curves(records: list[study.Record], p_values: np.ndarray, path: Path) -> None:
+    """Power over size by noise, and the p-values of campaigns with nothing hidden."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    sizes = sorted({r.case.times_mde for r in records})
+    for noise in sorted({r.case.noise for r in records}):
+        shares = []
+        for size in sizes:
+            group = [r for r in records if r.case.times_mde == size and r.case.noise == noise and r.isolable]
+            shares.append(levels.Level("", "", "", 0.0, True, sum(r.score.named for r in group if r.score), len(group)))
+        middle = np.array([v.share for v in shares])
+        low, high = (np.array([v.interval[i] for v in shares]) for i in (0, 1))
+        shift = 1.0 + 0.02 * len(left.containers)
+        left.errorbar(
+            np.array(sizes) * shift,
+            middle,
+            [middle - low, high - middle],
+            marker="o",
+            capsize=2,
+            label=noise.replace("_", " "),
+        )
+    left.set(
+        xscale="log",
+        xlabel="size, in minimal detectable sizes",
+        ylabel="share named, isolable campaigns",
+        ylim=(0, 1.03),
+    )
+    left.set_xticks(sizes, [f"{size:g}" for size in sizes], minor=False)
+    left.minorticks_off()
+    left.legend(title="noise")
+    p = np.sort(p_values)
+    right.plot([0, 1], [0, 1], color="0.7", label="uniform")
+    right.step(
+        np.concatenate([[0.0], p, [1.0]]),
+        np.concatenate([np.arange(len(p) + 1) / len(p), [1.0]]),
+        where="post",
+        label="nothing hidden",
+    )
+    right.set(xlabel="p-value of the campaign", ylabel="share of campaigns at or below")
+    right.legend()
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def _said(record: study.Record) -> str:
+    answer = record.answer
+    if answer is None:
+        return "–"
+    return (
+        "+".join(answer.causes)
+        if answer.verdict == "named" and len(answer.causes) == 1
+        else ("several named" if answer.verdict == "named" else answer.verdict)
+    )
+
+
+def _missed(records: list[study.Record]) -> list[str]:
+    """Every campaign of some that was not answered right, to draw it again."""
+    wrong = [r for r in records if r.score and r.answer and not r.score.right]
+    lines = [
+        "## Answers that were not right",
+        "",
+        "| seed | design | noise | hidden | isolable | said |",
+        "|---|---|---|---|---|---|",
+    ]
+    for r in sorted(wrong, key=lambda r: (str(r.case.effect), r.case.design)):
+        said = f"{r.answer.verdict} {', '.join(r.answer.causes) or ' and '.join(r.answer.driver)}" if r.answer else ""
+        isolable = "yes" if r.isolable else "no"
+        lines.append(
+            f"| {r.case.seed} | {r.case.design} | {r.case.noise} | {r.case.effect or '–'} | {isolable} | {said} |"
+        )
+    return [*lines, ""]
+
+
+def _confusion(records: list[study.Record], path: Path) -> None:
+    """Truth against what was said, share of each row."""
+    verdicts = ["several named", "ambiguous", "unknown", "adequate"]
+    truths = sorted({str(r.case.effect) for r in records}, key=lambda e: (not known(e), e))
+    said = [t for t in truths if known(t)]
+    said += sorted({_said(r) for r in records} - set(said) - set(verdicts)) + verdicts
+    table = np.zeros((len(truths), len(said)))
+    for r in records:
+        table[truths.index(str(r.case.effect)), said.index(_said(r))] += 1
+    share = table / table.sum(1, keepdims=True)
+    figure, axes = plt.subplots(figsize=(0.42 * len(said) + 3, 0.34 * len(truths) + 3), layout="constrained")
+    image = axes.imshow(share, cmap="Blues", vmin=0, vmax=1)
+    for (i, j), value in np.ndenumerate(share):
+        if value:
+            axes.text(
+                j, i, f"{100 * value:.0f}", ha="center", va="center", fontsize=7, color="w" if value > 0.5 else "k"
+            )
+    axes.set_xticks(range(len(said)), [s.replace("_", " ") for s in said], rotation=90)
+    axes.set_yticks(range(len(truths)), [t.replace("_", " ") for t in truths])
+    axes.set(xlabel="the diagnosis says", ylabel="hidden, 3 × minimal detectable size")
+    figure.colorbar(image, label="share of campaigns", shrink=0.6)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
