@@ -185,7 +185,7 @@ def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
         if runs:
             columns["run"] = runs[len(blocks)]
         columns["time"] = time - time[0]
-        columns["time_on"] = columns["time"] + _power_on(campaign)
+        columns["time_on"] = _time_on(campaign, time)
         for name in thermometers(names):
             columns[f"{name}_rate"] = _thermometer_rate(time, columns[name])
         if len(campaigns) > 1 and "campaign" not in names:
@@ -232,12 +232,14 @@ def _check_alike(first: Campaign, other: Campaign) -> None:
         raise CampaignError(f"{other.name}: the same data were given twice")
 
 
-def _power_on(campaign: Campaign) -> float:
-    """Time from power-on to the first row (s)."""
+def _time_on(campaign: Campaign, time: np.ndarray) -> np.ndarray:
+    """Time since power-on of each row (s): every run begins with one, or so long after it as the metadata say."""
     value = campaign.metadata.get("time_since_power_on", 0.0)
     if isinstance(value, str):
         raise CampaignError(f"{campaign.name}: metadata time_since_power_on is {value!r}, expected a number of seconds")
-    return float(value)
+    runs = campaign.columns.get("run", np.zeros(len(time)))
+    _, first, number = np.unique(runs, return_index=True, return_inverse=True)
+    return time - time[first][number] + float(value)
 
 
 def thermometer_rate(record: Record, temperature: np.ndarray) -> np.ndarray:

@@ -196,8 +196,10 @@ def _begun(part: Campaign, needed: set[str], calibration: Calibration) -> _Scan 
     if model.prepared(signals) is not model:
         return None  # which columns it takes, or which runs, only the whole tells
     # A rate of temperature is that of a smooth curve through the whole record.
-    lost = {f"{name}_rate": jnp.full_like(signals["time"], jnp.nan) for name in thermometers(part.columns)}
-    if np.isnan(np.asarray(model.predict(signals | lost))).any():
+    # So is the time since power-on of a run that began before these rows.
+    lost = [f"{name}_rate" for name in thermometers(part.columns)] + ["time_on"] * ("run" in part.columns)
+    unknown = jnp.full_like(signals["time"], jnp.nan)
+    if np.isnan(np.asarray(model.predict(signals | dict.fromkeys(lost, unknown)))).any():
         return None
     return _Scan(float(part.si("time")[0]), np.nan)
 

@@ -297,3 +297,20 @@ def test_a_coarse_output_that_drifts_does_not_stand_still(steps: float, rng: np.
             {"time": np.arange(3000.0), "output": 0.01 * output}, {"time": "s", "output": "deg/s"}, {"kind": "rate"}
         )
         assert stretch_still(campaign) is None
+
+
+@pytest.mark.long
+def test_a_warm_up_after_every_power_on(rng: np.random.Generator):
+    """20 deg/h that decay within 300 s of each start, in noise of 5: the room wanders, and the off times differ."""
+    design = DESIGNS["repeated_runs"](rng)
+    time, run = design.true["time"], design.columns["run"]
+    on = time - np.array([time[run == r].min() for r in run])
+    error = np.deg2rad((20.0 * np.exp(-on / 300.0) + 5.0 * rng.standard_normal(len(on))) / 3600)
+    campaign = gm.Campaign(
+        design.columns | {"output": np.rad2deg(error)}, design.units | {"output": "deg/s"}, design.metadata
+    )
+    found = gm.diagnose(campaign, gm.model_from_effects(["bias"]), hold_out=False)
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["bias_warmup"])
+    sizes = {p.name: p for p in found.causes[0].parameters}
+    assert sizes["time_constant"].value == pytest.approx(300.0, abs=4 * sizes["time_constant"].std)
+    assert sizes["amplitude"].value == pytest.approx(20.0, abs=4 * sizes["amplitude"].std)

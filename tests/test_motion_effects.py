@@ -153,6 +153,10 @@ def test_the_bank_says_what_a_campaign_cannot_show(rng: np.random.Generator):
     assert "centrifuge" in bank.not_testable["part of bias_acceleration_squared"]
     assert bank.not_testable["bias_magnetic"].startswith("needs a column magnetic_field")
     assert "in steps" in bank.not_testable["time_delay"]
+    # The Earth's rate alone: what bends within it would be no gyro beyond.
+    for name in ("scale_nonlinearity", "scale_sagnac_sine", "scale_spline", "saturation"):
+        assert "twice the Earth's" in bank.not_testable[name]
+    assert "scale_asymmetry" in names
     counted = campaign_of(design, noise)
     counted = counted.with_column("acceleration_input", 1e4 * counted.columns["acceleration_input"], "count")
     bank = build_bank(read_signals(counted))
@@ -260,6 +264,20 @@ def test_a_tilt_of_a_gyrocompass(gyrocompass: Campaign):
     assert part.name in ("east", "sine")
     true = 0.02 * np.rad2deg(EARTH) * 3600 * np.sin(0.7)
     assert abs(abs(part.value) - true) < 4 * part.std
+
+
+@pytest.mark.long
+def test_what_follows_rate_and_acceleration_together_is_unknown(rng: np.random.Generator):
+    """By neither of them alone: 10 deg/h rms in noise of 20."""
+    design = MOTION_DESIGNS["dynamic_rates"](rng)
+    assert design.motion is not None
+    product = design.true["rate"] * design.motion["rate"].derivative(design.true["time"])
+    error = 10 * DEG_H * product / np.std(product) + 20 * DEG_H * rng.standard_normal(len(product))
+    campaign = campaign_of(design, design.true["rate"] + error)
+    found = gyromodel.diagnose(campaign, model_from_effects(["scale_factor", "bias"]), hold_out=False)
+    assert found.verdict == "unknown"
+    assert found.driver is not None
+    assert found.driver.column == "rate and d(rate)/dt"
 
 
 @pytest.mark.long

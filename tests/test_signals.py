@@ -87,6 +87,23 @@ def test_columns_are_in_internal_units_and_time_starts_at_zero(rng: np.random.Ge
     assert record.data_hash == measured.digest()
 
 
+def test_every_run_begins_with_a_power_on():
+    """Or so long after it as the metadata say; time goes on through all."""
+    columns = {
+        "time": [0.0, 1.0, 50.0, 51.0, 52.0, 90.0],
+        "run": [1.0, 1.0, 2.0, 2.0, 2.0, 3.0],
+        "output": [0.0] * 5 + [1.0],
+    }
+    units = {"time": "min", "run": "", "output": "deg/s"}
+    campaign = Campaign(
+        {k: np.array(v) for k, v in columns.items()}, units, {"kind": "rate", "time_since_power_on": 30}
+    )
+    on = np.asarray(read_signals(campaign).signals["time_on"])[:6]
+    assert on == pytest.approx([30.0, 90.0, 30.0, 90.0, 150.0, 30.0])
+    on = np.asarray(read_signals(campaign.without("run")).signals["time_on"])[:6]
+    assert on == pytest.approx(60.0 * np.array(columns["time"]) + 30.0)
+
+
 def test_power_on_time_must_be_a_number(rng: np.random.Generator):
     measured = campaign(np.arange(9.0), rng.standard_normal(9))
     late = Campaign(measured.columns, measured.units, {"kind": "rate", "time_since_power_on": "soon"})

@@ -18,7 +18,7 @@ from gyromodel.compensation import compensate, reference_error
 from gyromodel.effects.drivers import Bias, BiasDrift
 from gyromodel.effects.geometry import TableTilt
 from gyromodel.effects.scale import ScaleFactor, ScaleNonlinearity
-from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureRate
+from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureRate, BiasWarmup
 from gyromodel.estimate import Calibration
 from gyromodel.files import read_campaign, write_campaign
 from gyromodel.model import GyroModel
@@ -124,7 +124,19 @@ def test_an_axis_and_a_reference_are_those_of_the_whole(
     assert f"{whole.compensated:.4g}" in said[0][1]
 
 
-WHOLE = ["memory", "increment", "missing", "irregular", "zarr", "constant", "lacking", "open", "cut", "flipped"]
+WHOLE = [
+    "memory",
+    "increment",
+    "missing",
+    "irregular",
+    "zarr",
+    "constant",
+    "lacking",
+    "open",
+    "begun",
+    "cut",
+    "flipped",
+]
 
 
 @pytest.mark.parametrize("what", WHOLE)
@@ -154,6 +166,9 @@ def test_what_needs_the_whole_is_left_to_it(
             calibration = Calibration(GyroModel((TableTilt(north=jnp.asarray(1e-6), east=jnp.asarray(0.0)),)))
             measured = measured.with_column("table_angle", np.arange(ROWS), "deg")
             measured = measured.with_column("azimuth", np.maximum(np.arange(ROWS) - 600, 0), "deg")
+        case "begun":  # a run's power-on is in the part where it begins
+            calibration = Calibration(GyroModel((BiasWarmup(amplitude=jnp.asarray(1e-6)),)))
+            measured = measured.with_column("run", np.where(np.arange(ROWS) < 600, 1.0, 2.0), "")
         case "cut" | "flipped":
             name = "log.csv.gz"
     write_campaign(measured, tmp_path / name)

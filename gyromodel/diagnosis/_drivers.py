@@ -101,8 +101,9 @@ def smooths(record: Record) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
 def products(record: Record, known: Container[str]) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Name, values of the first column, and product of each pair of columns, less those known.
 
-    All pairs as smooth functions would be too many. A product is what an effect becomes whose size follows another
-    column, such as a mass unbalance that changes with temperature. Columns of one kind have effects of their own.
+    The rate is paired with its own rate, too. All pairs as smooth functions would be too many. A product is what an
+    effect becomes whose size follows another column, such as a mass unbalance that changes with temperature. Columns of
+    one kind have effects of their own.
     """
     names = [n for n in driver_names(record) if n != "campaign"] if record.domain == "gyro" else []
     names = sorted(names, key=lambda n: n not in ("rate", "temperature"))
@@ -112,8 +113,15 @@ def products(record: Record, known: Container[str]) -> Iterator[tuple[str, np.nd
             continue
         if f"smooth({a}, {b})" not in known and f"smooth({b}, {a})" not in known:
             x, y = (np.asarray(record.signals[n]) for n in (a, b))
-            centred = (v - v[: record.rows].mean() for v in (x, y))
-            yield f"smooth({a}, {b})", x, np.prod(list(centred), axis=0)[:, None]
+            yield f"smooth({a}, {b})", x, _product(record, x, y)
+    if "rate" in names and (runs := _turning(record)):
+        rate = np.asarray(record.signals["rate"])
+        yield f"smooth(rate, {RATE_OF.format('rate')})", rate, _product(record, rate, _acceleration(record, runs))
+
+
+def _product(record: Record, *columns: np.ndarray) -> np.ndarray:
+    """Of two columns, less their means."""
+    return np.prod([v - v[: record.rows].mean() for v in columns], axis=0)[:, None]
 
 
 def _kind(record: Record, name: str) -> str:
@@ -172,16 +180,11 @@ def _slow(record: Record, name: str) -> bool:
 def _response(record: Record) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Any linear response to a moving rate: its values some samples before and after, over its rate of change."""
     rate, time = (np.asarray(record.signals[n])[: record.rows] for n in ("rate", "time"))
-    most = max(RESPONSE)
-    runs = [rows for rows in _runs(record) if len(rows) > most]
+    runs, most = _turning(record), max(RESPONSE)
     if not runs:
         return
-    if np.mean(np.concatenate([np.diff(rate[rows]) != 0 for rows in runs])) < MOVING:
-        return
     before = np.zeros((len(record.signals["time"]), len(RESPONSE)))
-    along = np.zeros(len(before))
     for rows in runs:
-        along[rows] = np.gradient(rate[rows], time[rows])
         # Beyond its ends a run goes on as it came.
         t, r = (np.pad(v[rows], most, mode="reflect", reflect_type="odd") for v in (time, rate))
         for i, k in enumerate(RESPONSE):
@@ -189,7 +192,24 @@ def _response(record: Record) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     # Of columns so much alike only what is left of each beside those before can be weighed.
     inside = np.column_stack([np.ones(record.rows), rate, before[: record.rows]])
     before[: record.rows] = np.linalg.qr(inside)[0][:, 2:]
-    yield RESPONSE_DRIVER, along, before
+    yield RESPONSE_DRIVER, _acceleration(record, runs), before
+
+
+def _turning(record: Record) -> list[np.ndarray]:
+    """The rows of each run that is long enough for a response to the rate, if the rate moves; else none."""
+    rate = np.asarray(record.signals["rate"])[: record.rows]
+    runs = [rows for rows in _runs(record) if len(rows) > max(RESPONSE)]
+    moving = runs and np.mean(np.concatenate([np.diff(rate[rows]) != 0 for rows in runs])) >= MOVING
+    return runs if moving else []
+
+
+def _acceleration(record: Record, runs: list[np.ndarray]) -> np.ndarray:
+    """The rate's own rate in some runs."""
+    rate, time = (np.asarray(record.signals[n]) for n in ("rate", "time"))
+    along = np.zeros(len(rate))
+    for rows in runs:
+        along[rows] = np.gradient(rate[rows], time[rows])
+    return along
 
 
 def _history(record: Record, name: str) -> Iterator[tuple[str, np.ndarray]]:

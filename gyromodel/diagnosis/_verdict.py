@@ -203,7 +203,7 @@ def judge(
     if len(vague) > 1:
         shared = dict.fromkeys(vague, 1.0 / len(vague))
         sets = [members | shared if c.effect in vague else members for c, members in zip(causes, sets, strict=True)]
-    sets = [members | _left_by(c, causes, extended) if len(members) == 1 else members
+    sets = [members | _left_by(c, causes, extended, c.effect in vague) if len(members) == 1 else members
             for c, members in zip(causes, sets, strict=True)]  # fmt: skip
     order = sorted(range(len(causes)), key=lambda i: -causes[i].statistic)
     causes, sets = [causes[i] for i in order], [sets[i] for i in order]
@@ -256,14 +256,18 @@ def judge(
     return Judgement("ambiguous", (*doubtful, *firm), sets[0], None, test, unexplained, tuple(findings))
 
 
-def _left_by(cause: Cause, causes: Sequence[Cause], estimate: Estimate) -> dict[str, float]:
-    """The far stronger thermal cause of which a faint one may be what its form, or a thermometer's noise, leaves."""
-    if cause.statistic > FAINT or is_noise(cause.effect):
+def _left_by(cause: Cause, causes: Sequence[Cause], estimate: Estimate, vague: bool) -> dict[str, float]:
+    """The stronger thermal cause that may leave a faint or a vague one, by its form or a thermometer's noise.
+
+    Beside a vague one it need not be far stronger.
+    """
+    if (cause.statistic > FAINT and not vague) or is_noise(cause.effect):
         return {}
     needs = {e.label: set(thermometers(e.columns_needed)) for e in estimate.model.effects}
     # A chamber's pace is a line.
     own = set().union(*needs.values()) if cause.effect == "bias_periodic" else needs.get(cause.effect, set())
-    others = [c for c in causes if c.statistic > OUTDONE * cause.statistic and own & needs.get(c.effect, set())]
+    least = (1.0 if vague else OUTDONE) * cause.statistic
+    others = [c for c in causes if c.statistic > least and own & needs.get(c.effect, set())]
     return {max(others, key=lambda c: c.statistic).effect: 0.5} if others else {}
 
 

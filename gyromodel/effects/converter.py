@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from gyromodel.effects._base import Effect, Signals, parameter, stack
+from gyromodel.effects.scale import WITHIN, may_bend
 
 # Limits searched, as parts of the largest rate, and different rates that must lie beyond one.
 LOWEST, HIGHEST, LIMITS, FEWEST_BEYOND = 0.2, 0.99, 24, 2
@@ -37,7 +38,7 @@ class Saturation(Effect):
     test = "Leave out the largest rates: a nonlinearity bends those below as well, saturation does not."
     held = ("share",)
     positive = True
-    untested = "has fewer than two different rates beyond any limit"
+    untested = f"has fewer than two different rates beyond any limit, or {WITHIN}"
 
     share: Float[Array, ""] = parameter("1", 1.0, "part of the output that saturates", default=1.0)
     limit: Float[Array, ""] = parameter("deg/s", 100.0, "largest rate that is told", linear=False, default=1.75)
@@ -59,7 +60,7 @@ class Saturation(Effect):
         """Limits with several rates beyond them."""
         levels = np.unique(np.round(np.abs(np.asarray(signals["rate"])), 9))
         limits = levels[-1] * np.linspace(LOWEST, HIGHEST, LIMITS)
-        return [cls(limit=limit) for limit in limits if np.sum(levels > limit) >= FEWEST_BEYOND]
+        return [cls(limit=v) for v in limits if np.sum(levels > v) >= FEWEST_BEYOND and may_bend(signals)]
 
 
 class BiasReadoutCode(Effect):

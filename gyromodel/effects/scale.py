@@ -14,6 +14,14 @@ from jaxtyping import Array, Float
 from gyromodel.effects._base import Effect, Signals, parameter, setting, stack
 from gyromodel.effects._shapes import OverTemperature, check_curve, curve_columns, curve_forms
 
+STRAIGHT = 1.5e-4  # rad/s, about twice the Earth's rate
+WITHIN = "all rates are within twice the Earth's, where no scale factor bends"
+
+
+def may_bend(signals: Signals) -> bool:
+    """Whether rates go beyond the Earth's, within which a gyro that measures more is straight."""
+    return float(jnp.nanmax(jnp.abs(signals["rate"]))) > STRAIGHT
+
 
 class ScaleFactor(Effect):
     """output = S0 · (rate + …): the gain from input rate to output.
@@ -65,6 +73,7 @@ class ScaleNonlinearity(Effect):
     site = "scale"
     needs = ("rate",)
     cause = "The readout electronics, the modulation depth or the table response bends the input-output curve."
+    untested = WITHIN
     test = "Run the rates in random order: self-heating at speed follows time, a nonlinearity follows rate."
 
     coefficients: Float[Array, " term"] = parameter(
@@ -99,7 +108,7 @@ class ScaleNonlinearity(Effect):
     def candidates(cls, signals: Signals) -> list[Self]:
         """Every set of powers."""
         sets = [s for r in (1, 2, 3, 4) for s in itertools.combinations((2, 3, 4, 5), r)]
-        return [cls(powers=s).prepared(signals) for s in sets]
+        return [cls(powers=s).prepared(signals) for s in sets] if may_bend(signals) else []
 
 
 class ScaleSagnacSine(Effect):
@@ -114,6 +123,7 @@ class ScaleSagnacSine(Effect):
     cause = "An open-loop fiber-optic gyro measures the sine of the Sagnac phase, and the simulation has it linear."
     held = ("share",)
     positive = True
+    untested = WITHIN
     test = "Drive it to rates where the Sagnac phase passes 1 rad: a cubic nonlinearity parts from the sine there."
 
     share: Float[Array, ""] = parameter("1", 1.0, "part of the output that follows the sine", default=1.0)
@@ -136,7 +146,7 @@ class ScaleSagnacSine(Effect):
     def candidates(cls, signals: Signals) -> list[Self]:
         """Sagnac phases of 0.1 to 3 rad at the largest rate."""
         top = float(jnp.nanmax(jnp.abs(signals["rate"])))
-        return [cls(kappa=phase / top) for phase in np.geomspace(0.1, 3.0, 12)] if top > 0 else []
+        return [cls(kappa=phase / top) for phase in np.geomspace(0.1, 3.0, 12)] if may_bend(signals) else []
 
 
 class ScaleTemperature(OverTemperature):
@@ -277,6 +287,7 @@ class ScaleSpline(Effect):
         "Repeat the rates both ways and in random order: anomalous test points and resonances do not come back alike."
     )
     supersedes = ("scale_nonlinearity",)
+    untested = f"has fewer than ten different rates, or {WITHIN}"
 
     coefficients: Float[Array, " bend"] = parameter("ppm", 100.0, "bends, as parts of the largest rate", default=())
     knots: int = eqx.field(static=True, default=6)
@@ -322,4 +333,4 @@ class ScaleSpline(Effect):
     def candidates(cls, signals: Signals) -> list[Self]:
         """Smooth curves of five to seven knots, where there are rates enough."""
         levels = len(np.unique(np.round(np.asarray(signals["rate"]), 9)))
-        return [cls(knots=k).prepared(signals) for k in (5, 6, 7) if levels >= 2 * k]
+        return [cls(knots=k).prepared(signals) for k in (5, 6, 7) if levels >= 2 * k and may_bend(signals)]

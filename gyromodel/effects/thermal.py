@@ -374,7 +374,7 @@ class BiasTemperatureGradientRate(_BetweenThermometers):
 
 
 class BiasWarmup(Effect):
-    """E += Σ A_i exp(−t/τ_i), t from power-on; as many terms as the data ask for."""
+    """E += Σ A_i exp(−t/τ_i), t from power-on, in each run anew; as many terms as the data ask for."""
 
     id = "bias_warmup"
     site = "rate"
