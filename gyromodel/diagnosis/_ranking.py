@@ -25,8 +25,9 @@ from gyromodel.noise import markov_cells, restricted_likelihood
 # Cells within this many nats of the best, for any candidate that matters, get their neighbours searched too: those
 # better than nothing added and not hopelessly behind the best.
 NEARBY, HOPELESS = 7.0, 30.0
-# Prior odds (ln) of a Markov process against flicker and random walk of all sizes, absent ones too.
-MARKOV_PRIOR = np.log(0.2)
+# Prior odds (ln) of a Markov process against flicker and random walk of all sizes, absent ones too: as more than is
+# stated, and as the name of what a campaign's noise is, where flicker passes for most of them.
+MARKOV_PRIOR, MARKOV_NAMED = np.log(0.2), np.log(0.05)
 # Functions of time that one run cannot tell from a random walk.
 SLOW_IN_TIME = ("bias_drift", "bias_warmup", "bias_step")
 # Nats that the first name needs less where the noise beside it has no random walk: most of what noise imitates, a walk
@@ -252,7 +253,8 @@ def noise_kinds(scanner: Scanner, ranking: Ranking) -> dict[str, float]:
         parts = (("noise_white", True), ("noise_flicker", flicker[g] > 0), ("noise_random_walk", walk[g] > 0))
         kind = " + ".join(name for name, there in parts if there)
         logs.setdefault(kind, []).append(r.log_likelihood + ranking.log_prior[g])
-    logs["noise_white + noise_markov"] = list(_of_markov(scanner, 0.0, ranking.baseline_columns, ranking.residual)[0])
+    markov, _ = _of_markov(scanner, 0.0, ranking.baseline_columns, ranking.residual)
+    logs["noise_white + noise_markov"] = list(markov + MARKOV_NAMED - MARKOV_PRIOR)
     total = log_sum([v for of_kind in logs.values() for v in of_kind])
     weight = {kind: float(np.exp(log_sum(v) - total)) for kind, v in logs.items() if v}
     return dict(sorted(weight.items(), key=lambda item: -item[1]))
