@@ -259,8 +259,8 @@ def test_strong_noise_is_told_by_its_colour(kind: str, other: str, rng: np.rando
             coloured = truth.random_walk(ROWS, STEP, 0.5 * N / STEP, rng)
         estimate = fit_record(with_output(record, coloured + truth.white(ROWS, STEP, N, rng)), model)
         at_length = {  # Allan deviations at a quarter of the record
-            "noise_flicker": 0.664 * float(estimate.model.noise["noise_flicker"]),
-            "noise_random_walk": float(estimate.model.noise["noise_random_walk"]) * np.sqrt(ROWS * STEP / 4 / 3),
+            "noise_flicker": 0.664 * float(estimate.model.noise.get("noise_flicker", 0.0)),
+            "noise_random_walk": float(estimate.model.noise.get("noise_random_walk", 0.0)) * np.sqrt(ROWS * STEP / 12),
         }
         told.append(at_length[f"noise_{kind}"] > at_length[other])
     assert binom.cdf(sum(told), SEEDS, 0.85) > RARE, sum(told)
