@@ -33,6 +33,14 @@ def test_the_end_towards_zero_is_that_of_the_truncated_law(z: float) -> None:
     assert norm.sf(abs(z) - inner) / told == pytest.approx(0.025, rel=1e-3)
 
 
+@pytest.mark.parametrize("z", [6.0, 11.9, 12.33, -40.0, 200.0])
+def test_what_is_just_large_enough_may_be_nothing(z: float) -> None:
+    """Of what is told only at z or beyond, the nearer end is where the other sign is 39 times as likely."""
+    low, high = after_selection(z, abs(z))
+    inner = low if z > 0 else -high
+    assert inner == pytest.approx(-np.log(39) / (2 * abs(z)), rel=0.04)
+
+
 def test_far_above_what_is_needed_nothing_is_allowed_for() -> None:
     assert after_selection(30.0, LEAST) == pytest.approx((30 - 1.96, 30 + 1.96), abs=1e-3)
 

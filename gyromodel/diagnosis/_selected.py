@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.special import ndtr
+from scipy.special import log_ndtr
 
 from gyromodel.diagnosis._evidence import explained_for
 
-# Ends of a 95 % interval, in standard deviations, and a distance from the estimate that none reaches.
+# Ends of a 95 % interval, in standard deviations, and how far beyond zero none reaches.
 HALF, FAR = 1.96, 12.0
 
 
@@ -21,10 +21,11 @@ def after_selection(z: float, least: float) -> tuple[float, float]:
     size, cut = abs(z), min(least, abs(z))
 
     def above(mean: float) -> float:
-        """P(Z ≥ size | |Z| ≥ cut) beyond what the end leaves."""
-        return float(ndtr(mean - size) / (ndtr(mean - cut) + ndtr(-mean - cut)) - ndtr(-HALF))
+        """P(Z ≥ size | |Z| ≥ cut) over what the end leaves (ln)."""
+        seen = np.logaddexp(log_ndtr(mean - cut), log_ndtr(-mean - cut))
+        return float(log_ndtr(mean - size) - seen - log_ndtr(-HALF))
 
-    ends = np.copysign(1.0, z) * np.array([brentq(above, size - FAR, size), size + HALF])
+    ends = np.copysign(1.0, z) * np.array([brentq(above, -FAR, size), size + HALF])
     return float(ends.min()), float(ends.max())
 
 
