@@ -5,8 +5,8 @@
 writes a table with 95 % Clopper-Pearson intervals, a confusion matrix, power curves and p-values to
 benchmarks/results/discovery.md, discovery_confusion.png and discovery_power.png. --scale 0.25 takes a quarter of the
 campaigns. What was run is kept in benchmarks/results/discovery/, by seed: a study that was stopped goes on where it
-was, and the page is made of all seeds there, which differ by a hundred or more, as parts of one seed differ by less.
---page makes it again without running anything.
+was. The page is made of all finished seeds there, of this engine if it has any; they differ by a hundred or more, as
+parts of one seed differ by less. --page makes it again without running anything.
 """
 
 from __future__ import annotations
@@ -144,6 +144,8 @@ def main(argv: list[str] | None = None) -> None:
             kept.save()
     found = [Kept(path) for path in sorted(args.kept.glob("seed_*.json.gz"))]
     whole = [k for k in found if k.seconds]
+    # Of one engine: this one, where it has been studied.
+    whole = [k for k in whole if k.code == code()] or whole
     if not whole:
         raise SystemExit(f"{args.kept} holds no finished study")
     write_page(args.output, whole)

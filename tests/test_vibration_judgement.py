@@ -26,10 +26,12 @@ from gyromodel.platform import (
     vibration_test,
 )
 from gyromodel.report import vibration_words
+from gyromodel.report._numbers import with_uncertainty
 from gyromodel.report._vibration_words import vibration_sentence
 from tests.truth.platform_demo import demo_log
 
 LOG = Path(gyromodel.__file__).parent / "data" / "platform_vibration.csv.gz"
+README = Path(__file__).resolve().parents[1] / "README.md"
 LATE, SECOND = 2e-3, np.deg2rad(1 / 3600)
 
 
@@ -131,6 +133,8 @@ def test_the_crossover_shows_where_runs_reach_it(amplifier: float):
     [line] = [line for line in vibration_words(found).lines if "crossover is" in line]
     assert "±" in line
     if fitted:
+        told = with_uncertainty(found.crossover.value, found.crossover.std, found.crossover.unit)
+        assert told in " ".join(README.read_text(encoding="utf-8").split())
         assert found.series is not None
         assert parameters(found.series)[-1].name == "crossover"
         assert parameters(found.series)[-1].value == pytest.approx(true, abs=3 * parameters(found.series)[-1].std)
