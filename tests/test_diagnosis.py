@@ -265,6 +265,8 @@ def test_a_fold_does_not_search_what_only_the_rows_left_out_would_tell(rng: np.r
 def test_a_warm_up_that_was_over_is_not_searched() -> None:
     time = jnp.arange(100.0) * 10.0
     assert BiasWarmup.candidates({"time_on": time + 1e5}) == []
+    # Every row a run of its own: nothing shows how it decays.
+    assert BiasWarmup.candidates({"time_on": jnp.zeros(100)}) == []
     assert min(e.time_constant.item() for e in BiasWarmup.candidates({"time_on": time + 600.0})) >= 50.0 * (1 - 1e-9)
 
 

@@ -23,7 +23,7 @@ HARMONICS = (1, 2, 3, 4)
 # A rate that differs from a sine of the azimuth by less than this part of itself is one.
 ALIKE = 1e-3
 # Of a cosine and a sine that are searched, which have an amplitude: both, or one, where the other is known otherwise.
-PARTS = tuple((jnp.zeros(cosine), jnp.zeros(sine)) for cosine, sine in ((1, 1), (1, 0), (0, 1)))
+PARTS = tuple((np.zeros(cosine), np.zeros(sine)) for cosine, sine in ((1, 1), (1, 0), (0, 1)))
 
 
 def cross_rates(names: Iterable[str]) -> list[str]:

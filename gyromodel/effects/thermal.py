@@ -412,4 +412,6 @@ class BiasWarmup(Effect):
         on = np.asarray(signals["time_on"])
         span = float(on.max() - on.min())
         shortest = max(span / 200.0, 2.0 * float(np.median(np.diff(on))), float(on.min()) / LONG_OVER)
-        return [] if shortest > span else [cls(time_constant=tau) for tau in np.geomspace(shortest, span, 14)[:, None]]
+        if not 0.0 < shortest <= span:
+            return []
+        return [cls(time_constant=tau) for tau in np.geomspace(shortest, span, 14)[:, None]]
