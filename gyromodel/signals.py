@@ -21,6 +21,8 @@ from gyromodel.units import UnitError, convertible, factor, internal_unit, quant
 
 # A step this many times the median one separates stretches of a record.
 GAP = 10.0
+# And one this many times the median, where a run begins, is time in which the gyro was off.
+OFF = 2.0
 # Longer records are padded less: the work outweighs the compiling.
 FINER_FROM = 4096
 # A clock is regular if most steps differ by less than this part of the median one; the others are gaps.
@@ -233,13 +235,17 @@ def _check_alike(first: Campaign, other: Campaign) -> None:
 
 
 def _time_on(campaign: Campaign, time: np.ndarray) -> np.ndarray:
-    """Time since power-on of each row (s): every run begins with one, or so long after it as the metadata say."""
+    """Time since power-on of each row (s): a run behind a gap begins with one, or so long after it as the metadata say.
+
+    One that follows without a gap was not off before.
+    """
     value = campaign.metadata.get("time_since_power_on", 0.0)
     if isinstance(value, str):
         raise CampaignError(f"{campaign.name}: metadata time_since_power_on is {value!r}, expected a number of seconds")
     runs = campaign.columns.get("run", np.zeros(len(time)))
-    _, first, number = np.unique(runs, return_index=True, return_inverse=True)
-    return time - time[first][number] + float(value)
+    step = np.diff(time)
+    begins = np.append(True, (np.diff(runs) != 0) & (step > OFF * np.median(step)))
+    return time - time[np.flatnonzero(begins)][np.cumsum(begins) - 1] + float(value)
 
 
 def thermometer_rate(record: Record, temperature: np.ndarray) -> np.ndarray:

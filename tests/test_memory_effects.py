@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.stats import binom
 
 import gyromodel as gm
@@ -314,3 +315,31 @@ def test_a_warm_up_after_every_power_on(rng: np.random.Generator):
     sizes = {p.name: p for p in found.causes[0].parameters}
     assert sizes["time_constant"].value == pytest.approx(300.0, abs=4 * sizes["time_constant"].std)
     assert sizes["amplitude"].value == pytest.approx(20.0, abs=4 * sizes["amplitude"].std)
+
+
+@pytest.mark.long
+def test_runs_take_nothing_from_the_lags_that_are_searched() -> None:
+    """A bias that follows the temperature's rate 250 s late, in runs of 400 s without a gap between them."""
+    rows, before = 400, 600
+    time = 10.0 * np.arange(-before, rows)
+    temperature = 20 + 10 * np.sin(2 * np.pi * time / 2000) + 3 * np.sin(2 * np.pi * time / 700)
+    rate = np.gradient(temperature, time)
+    late = lfilter([0.04], [1.0, -0.96], rate)[before:]
+    output = 5 + 150 * late + np.random.default_rng(1).standard_normal(rows)
+    columns = {"time": time[before:], "temperature": temperature[before:], "output": output}
+    units = {"time": "s", "temperature": "degC", "output": "deg/h", "run": ""}
+    campaign = gm.Campaign(columns | {"run": np.arange(rows) // 40 * 1.0}, units, {"kind": "rate"})
+    found = gm.diagnose(campaign, gm.model_from_effects(["bias"]), hold_out=False)
+    assert (found.verdict, found.causes[0].effect) == ("named", "bias_temperature_rate")
+
+
+@pytest.mark.long
+def test_runs_of_one_power_on_have_one_warm_up(rng: np.random.Generator) -> None:
+    """8 deg/h that decay with 600 s, in noise of 1: a run that follows without a gap was not off before."""
+    time = 10.0 * np.arange(400)
+    output = 8 * np.exp(-time / 600) + rng.standard_normal(400)
+    columns = {"time": time, "run": np.arange(400) // 40 * 1.0, "output": output}
+    campaign = gm.Campaign(columns, {"time": "s", "run": "", "output": "deg/h"}, {"kind": "rate"})
+    found = gm.diagnose(campaign, gm.model_from_effects(["bias"]), hold_out=False)
+    assert found.verdict in ("named", "ambiguous")
+    assert "bias_warmup" in found.credible_set

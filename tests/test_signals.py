@@ -87,20 +87,15 @@ def test_columns_are_in_internal_units_and_time_starts_at_zero(rng: np.random.Ge
     assert record.data_hash == measured.digest()
 
 
-def test_every_run_begins_with_a_power_on():
-    """Or so long after it as the metadata say; time goes on through all."""
-    columns = {
-        "time": [0.0, 1.0, 50.0, 51.0, 52.0, 90.0],
-        "run": [1.0, 1.0, 2.0, 2.0, 2.0, 3.0],
-        "output": [0.0] * 5 + [1.0],
-    }
-    units = {"time": "min", "run": "", "output": "deg/s"}
-    campaign = Campaign(
-        {k: np.array(v) for k, v in columns.items()}, units, {"kind": "rate", "time_since_power_on": 30}
-    )
-    on = np.asarray(read_signals(campaign).signals["time_on"])[:6]
-    assert on == pytest.approx([30.0, 90.0, 30.0, 90.0, 150.0, 30.0])
-    on = np.asarray(read_signals(campaign.without("run")).signals["time_on"])[:6]
+def test_a_run_behind_a_gap_begins_with_a_power_on():
+    """Or so long after it as the metadata say; the fourth run follows the third without one."""
+    columns = {"time": [0.0, 1.0, 50.0, 51.0, 52.0, 90.0, 91.0], "run": [1.0, 1.0, 2.0, 2.0, 2.0, 3.0, 4.0]}
+    measured = {k: np.array(v) for k, v in columns.items()} | {"output": np.arange(7.0)}
+    units, known = {"time": "min", "run": "", "output": "deg/s"}, {"kind": "rate", "time_since_power_on": 30}
+    campaign = Campaign(measured, units, known)
+    on = np.asarray(read_signals(campaign).signals["time_on"])[:7]
+    assert on == pytest.approx([30.0, 90.0, 30.0, 90.0, 150.0, 30.0, 90.0])
+    on = np.asarray(read_signals(campaign.without("run")).signals["time_on"])[:7]
     assert on == pytest.approx(60.0 * np.array(columns["time"]) + 30.0)
 
 

@@ -160,6 +160,7 @@ def test_the_embedded_log(demo: VibrationTest):
     best = demo.supported[0]
     assert best == "time offset, wet and dry friction, integration estimated, without axis Y"
     assert demo.left_out == ("Y",)
+    assert demo.firm
     # Of those that do not only add to it the next, a resonance in place of dry friction without Z, is e^-3 as likely.
     first = demo.explanations[best]
     more = [e for e in demo.explanations.values() if first.alternative.within(e.alternative) and e.left_out == ("Y",)]

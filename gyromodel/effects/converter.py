@@ -58,9 +58,11 @@ class Saturation(Effect):
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
         """Limits with several rates beyond them."""
+        if not may_bend(signals):
+            return []
         levels = np.unique(np.round(np.abs(np.asarray(signals["rate"])), 9))
         limits = levels[-1] * np.linspace(LOWEST, HIGHEST, LIMITS)
-        return [cls(limit=v) for v in limits if np.sum(levels > v) >= FEWEST_BEYOND and may_bend(signals)]
+        return [cls(limit=limit) for limit in limits if np.sum(levels > limit) >= FEWEST_BEYOND]
 
 
 class BiasReadoutCode(Effect):

@@ -22,8 +22,8 @@ from gyromodel.effects._base import Effect, Signals, parameter, stack
 HARMONICS = (1, 2, 3, 4)
 # A rate that differs from a sine of the azimuth by less than this part of itself is one.
 ALIKE = 1e-3
-# Of a cosine and a sine that are searched, which have an amplitude: both, or one, where the other is known otherwise.
-PARTS = tuple((np.zeros(cosine), np.zeros(sine)) for cosine, sine in ((1, 1), (1, 0), (0, 1)))
+# Amplitudes of the cosine and of the sine that are searched: both, or one, where the other is known otherwise.
+PARTS = ((1, 1), (1, 0), (0, 1))
 
 
 def cross_rates(names: Iterable[str]) -> list[str]:
@@ -141,7 +141,8 @@ class TableTilt(Effect):
     def candidates(cls, signals: Signals) -> list[Self]:
         """Of the one angle, if it varies, both parts, and each."""
         angle = cls().prepared(signals).angle
-        return [cls(n, e, angle) for n, e in PARTS] if varying(signals, [angle]) else []
+        parts = PARTS if varying(signals, [angle]) else ()
+        return [cls(jnp.zeros(north), jnp.zeros(east), angle) for north, east in parts]
 
 
 class TableHarmonic(Effect):
@@ -245,7 +246,8 @@ class BiasMagnetic(Effect):
             sets = dict.fromkeys([*((n,) for n in names), tuple(names)])
             return [cls(field=s) for s in sets]
         angle = cls().prepared(signals).angle
-        return [cls(cosine=c, sine=s, angle=angle) for c, s in PARTS] if angle and varying(signals, [angle]) else []
+        parts = PARTS if angle and varying(signals, [angle]) else ()
+        return [cls(cosine=jnp.zeros(cosine), sine=jnp.zeros(sine), angle=angle) for cosine, sine in parts]
 
 
 def _two_parts(*amplitudes: Any) -> list[Array]:

@@ -11,16 +11,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from gyromodel._checks import accelerations
 from gyromodel.effects._base import Effect, Signals, parameter, setting, stack
 from gyromodel.effects._shapes import OverTemperature, check_curve, curve_columns, curve_forms
 
 STRAIGHT = 1.5e-4  # rad/s, about twice the Earth's rate
-WITHIN = "all rates are within twice the Earth's, where no scale factor bends"
+WITHIN = "all rates are the Earth's, in attitudes that turn against gravity: no scale factor bends within them"
 
 
 def may_bend(signals: Signals) -> bool:
-    """Whether rates go beyond the Earth's, within which a gyro that measures more is straight."""
-    return float(jnp.nanmax(jnp.abs(signals["rate"]))) > STRAIGHT
+    """Whether a curve of the scale factor is worth looking for: not in a tumble under the Earth's rate.
+
+    There a power of the rate follows specific force, and a gyro that bends so early would be no gyro beyond.
+    """
+    tumbles = any(np.ptp(np.asarray(signals[name])) > 0 for name in accelerations(signals))
+    return not tumbles or float(jnp.nanmax(jnp.abs(signals["rate"]))) > STRAIGHT
 
 
 class ScaleFactor(Effect):
@@ -146,7 +151,7 @@ class ScaleSagnacSine(Effect):
     def candidates(cls, signals: Signals) -> list[Self]:
         """Sagnac phases of 0.1 to 3 rad at the largest rate."""
         top = float(jnp.nanmax(jnp.abs(signals["rate"])))
-        return [cls(kappa=phase / top) for phase in np.geomspace(0.1, 3.0, 12)] if may_bend(signals) else []
+        return [cls(kappa=phase / top) for phase in np.geomspace(0.1, 3.0, 12)] if top > 0 and may_bend(signals) else []
 
 
 class ScaleTemperature(OverTemperature):

@@ -142,7 +142,7 @@ class BiasTemperatureRate(Effect):
 
 def _lags(signals: Signals) -> list[Array]:
     """None, then each from the sample interval to a part of the run, where the rate is followed so closely."""
-    shortest, longest = interval(signals), LONGEST * float(np.ptp(np.asarray(signals["time_on"])))
+    shortest, longest = interval(signals), LONGEST * float(np.ptp(np.asarray(signals["time"])))
     if longest < shortest or not resolved(signals, "temperature_rate"):
         return [jnp.zeros(0)]
     number = 1 + int(np.log(longest / shortest) / np.log(NEXT))
@@ -374,7 +374,7 @@ class BiasTemperatureGradientRate(_BetweenThermometers):
 
 
 class BiasWarmup(Effect):
-    """E += Σ A_i exp(−t/τ_i), t from power-on, in each run anew; as many terms as the data ask for."""
+    """E += Σ A_i exp(−t/τ_i), t from power-on, anew in each run behind a gap; as many terms as the data ask for."""
 
     id = "bias_warmup"
     site = "rate"

@@ -58,8 +58,8 @@ class VibrationTest:
         possible: explanations that are not excluded, not far behind, and add nothing but what is seen, best first.
         few: whether the runs are too few to name one: some of these are left too few degrees of freedom, or there is
             none whose numbers are determined.
-        held: whether the angles, overtones included, hold the possible ones too; where they hold none, nothing offered
-            explains the runs.
+        held: whether the angles, overtones included, do not exclude the possible ones; where they exclude all, nothing
+            offered explains the runs.
         further: of further tests of all axes, the least separation of any two of the first possible ones, in standard
             deviations.
         crossover: of the loop, where the runs determine it beside the rest of the first possible one.
@@ -92,8 +92,8 @@ class VibrationTest:
 
     @property
     def firm(self) -> bool:
-        """Whether one explanation alone is supported, by the runs' own errors and by the angles."""
-        return len(self.supported) == 1 and self.scatter_stated and self.held
+        """Whether one explanation alone is supported, by the runs' own errors and by the angles, which determine it."""
+        return len(self.supported) == 1 and self.scatter_stated and self.held and self.series is not None
 
     @property
     def left_out(self) -> tuple[str, ...]:
@@ -137,6 +137,7 @@ class VibrationTest:
             "supported": list(self.supported),
             "possible": list(self.possible),
             "too_few_runs": self.few,
+            "held_by_angles": self.held,
             "firm": self.firm,
             "crossover": self.crossover and self.crossover._asdict(),
             "further_tests": self.further,

@@ -29,7 +29,7 @@ def vibration_words(test: VibrationTest) -> Words:
     remarks = [f"Note: {remark}." for remark in test.remarks]
     told = explained(test)
     lines = [*notes(test), *remarks, "", *told.lead, *(f"- {item}" for item in told.items), *told.rest]
-    lines += [f"Next test: {told.next}"] if told.next else []
+    lines += [f"Next test: {told.next}" if test.few else told.next] if told.next else []
     return Words(head, [_run(response) for response in test.responses], lines)
 
 
@@ -66,6 +66,8 @@ def vibration_sentence(test: VibrationTest) -> str:
         return f"{limits}; they are too few to name what explains them."
     if not (test.scatter_stated and test.held):
         return f"{limits}; nothing that is offered explains them within their errors."
+    if len(test.supported) == 1 and not test.firm:
+        return f"{limits}; the angles do not determine the one explanation that is not excluded."
     if not test.firm:
         return f"{limits}; {len(test.supported)} explanations of them cannot be told apart."
     name = test.possible[0]
@@ -110,9 +112,11 @@ def explained(test: VibrationTest) -> Explained:
         lead.append("The standard errors above exclude every explanation offered here.")
     elif not test.held:
         lead.append("The angles, overtones included, exclude what the standard errors do not: something sticks.")
-    which = "The runs are too few to name one explanation. These would do" if test.few else "What comes nearest"
-    if test.scatter_stated and test.held and not test.few:
-        which = f"What explains {'the other' if test.left_out else 'all'} runs"
+    if test.few:
+        lead.append("The runs are too few to name one explanation.")
+    which = "What comes nearest"
+    if test.scatter_stated and test.held:
+        which = "These would do" if test.few else f"What explains {'the other' if test.left_out else 'all'} runs"
     lead.append(f"{which}, judged by {judged}:")
     shown = test.possible[:_SHOWN]
     items = [f"{name}: {_values(test.explanations[name])}." for name in shown]
