@@ -13,11 +13,13 @@ from gyromodel.model import effect_class
 
 # Candidates whose sums of squares differ by less than this part of the noise variance have the same signal …
 ALIKE = 0.2
+# … and by less than this part (one nat) what one of them is, the other may be.
+CLOSE = 2.0
 # … where their columns lie no farther apart than this sine: among many lines one explains as much by chance.
 HELD = 0.5
 
 
-def twins(scanner: Scanner, ranking: Ranking, name: str) -> set[str]:
+def twins(scanner: Scanner, ranking: Ranking, name: str, alike: float = ALIKE) -> set[str]:
     """Effects whose signals hold a candidate's, with at most one coefficient more.
 
     No size of it would tell them apart on this campaign. A form that contains another which was searched is no twin: it
@@ -28,8 +30,8 @@ def twins(scanner: Scanner, ranking: Ranking, name: str) -> set[str]:
         return set()
     result = ranking.results[ranking.best_cell(name)]
     _, explained, q = result.best[name]
-    least = explained - ALIKE * (result.rss - explained) / ranking.samples
-    alike = {
+    least = explained - alike * (result.rss - explained) / ranking.samples
+    near = {
         k
         for k, (_, t, width) in result.best.items()
         if k not in (name, "outliers", "bias_step" if name == "bias" else "")
@@ -37,14 +39,14 @@ def twins(scanner: Scanner, ranking: Ranking, name: str) -> set[str]:
         and width <= q + 1 and t >= least
         and not result.best.keys() & set(effect_class(k).supersedes) - {k}
     }  # fmt: skip
-    return {k for k in alike if (apart := separation(scanner, ranking, name, k)) is not None and apart <= HELD}
+    return {k for k in near if (apart := separation(scanner, ranking, name, k)) is not None and apart <= HELD}
 
 
 def like(scanner: Scanner, ranking: Ranking, name: str, others: Sequence[str]) -> bool:
-    """Whether a candidate is one of some names, or has the same signal as one of them."""
+    """Whether a candidate is one of some names, or has much the same signal as one that does nearly as well."""
     if name in others or name == "outliers" or name not in ranking.results[ranking.best_cell(name)].best:
         return name in others
-    return not twins(scanner, ranking, name).isdisjoint(others)
+    return not twins(scanner, ranking, name, CLOSE).isdisjoint(others)
 
 
 def columns_of_best(scanner: Scanner, ranking: Ranking, name: str) -> np.ndarray | None:

@@ -17,7 +17,7 @@ import numpy as np
 
 from gyromodel import __version__
 from gyromodel._cache import cache_folder
-from gyromodel.diagnosis._ranking import EASE, cells_of_weight, ease, rank, skipped, tangents
+from gyromodel.diagnosis._ranking import EASE, EXEMPT, cells_of_weight, ease, rank, skipped, tangents
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.estimate import Estimate, filter_of
 from gyromodel.numerics.state_space import colour
@@ -39,7 +39,7 @@ def null_scores(
 ) -> np.ndarray:
     """S of each draw of the baseline's own noise, from the cache where this design has been drawn before.
 
-    S is the largest ln B, with what a name needs less where the noise beside it has no random walk.
+    S is the largest ln B, with what a name needs less or more for what a random walk makes (`Ranking.significance`).
 
     Args:
         scanner: the search laid out on the record.
@@ -73,9 +73,12 @@ def null_scores(
         null, each = np.logaddexp.reduce(logs), []
         for name in sorted(names):
             beside = logs + np.stack([b.evidence[name] for b in batches])
-            each.append(
-                np.logaddexp.reduce(beside) - null + np.where(walks[beside.argmax(axis=0)], 0.0, ease(name, False))
-            )
+            evidence = np.logaddexp.reduce(beside) - null
+            own = evidence + np.where(walks[beside.argmax(axis=0)], 0.0, ease(name, False))
+            if walks.any() and name not in EXEMPT:
+                among = np.logaddexp.reduce(beside[walks]) - np.logaddexp.reduce(logs[walks])
+                own -= np.maximum(evidence - among, 0.0)
+            each.append(own)
         scores.append(np.max(each, axis=0))
         say("calibrating the threshold", 0.06 + 0.18 * min(1.0, (start + DRAWS_TOGETHER) / draws))
     found = np.concatenate(scores)[:draws]
@@ -92,7 +95,7 @@ def _design(scanner: Scanner, baseline: Estimate, draws: int, seed: int) -> tupl
     """A digest of what must be the same for draws to serve, and the course of what may differ a little."""
     record, bank = scanner.record, scanner.bank
     searched = [*((b.name, b.structure) for b in bank.blocks if b.kind == "effect"), *bank.scans]
-    same = (__version__, EASE, baseline.model.labels, sorted(baseline.model.fixed), scanner.stated, draws, seed,
+    same = (__version__, EASE, EXEMPT, baseline.model.labels, sorted(baseline.model.fixed), scanner.stated, draws, seed,
             searched, scanner.runs)  # fmt: skip
     columns = []
     for name in sorted(n for n in record.signals if n.startswith(SET)):

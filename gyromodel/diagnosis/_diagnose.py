@@ -20,7 +20,7 @@ from gyromodel.diagnosis._isolation import settling_test
 from gyromodel.diagnosis._misfit import excess_band, unexplained_axes
 from gyromodel.diagnosis._noise_causes import as_cause, quantisation, telegraph
 from gyromodel.diagnosis._points import dwells_apart
-from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, cells_of_weight, ease, is_driver, is_noise, noise_kinds
+from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, cells_of_weight, is_driver, is_noise, noise_kinds
 from gyromodel.diagnosis._result import Candidate, Cause, Diagnosis, Gain, ParameterValue, Round
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import Progress, Selection, search, significant_driver, steadied
@@ -332,7 +332,7 @@ def _like_hops(selection: Selection, free: Estimate) -> bool:
 def _eased(first: Ranking) -> float:
     """Nats that the leading name needed less."""
     name, _ = first.best(drivers=False)
-    return ease(name, first.walks[first.best_cell(name)]) if name else 0.0
+    return first.eased(name) - first.more_needed(name) if name else 0.0
 
 
 def _p_value(selection: Selection, nulls: np.ndarray) -> float:

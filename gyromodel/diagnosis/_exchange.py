@@ -18,8 +18,8 @@ from gyromodel.model import record_span
 
 # Lines that lead every other name by this much (nats) are not chosen again.
 LINE_LEAD = 20.0
-# The lead (nats) over a random walk at which what it imitates is put beside it.
-SLOW_LEAD = 3.5
+# The lead (nats) over a random walk at which what it imitates is put beside it: the walk alone is one in twenty.
+SLOW_LEAD = float(np.log(19.0))
 
 
 def exchanged(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[list[Found], Estimate, dict[int, Ranking]]:

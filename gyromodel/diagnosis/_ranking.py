@@ -10,10 +10,11 @@ import numpy as np
 
 from gyromodel._checks import thermometers
 from gyromodel.diagnosis._bank import Bank
+from gyromodel.diagnosis._batch import CellResult
 from gyromodel.diagnosis._drivers import RESPONSE_DRIVER
 from gyromodel.diagnosis._evidence import log_sum
 from gyromodel.diagnosis._lines import lines_of
-from gyromodel.diagnosis._scan import CellResult, Scanner
+from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._tangents import Tangent
 from gyromodel.effects import CATALOGUE
 from gyromodel.effects._base import evaluate
@@ -33,6 +34,8 @@ SLOW_IN_TIME = ("bias_drift", "bias_warmup", "bias_step")
 # Nats that the first name needs less where the noise beside it has no random walk: most of what noise imitates, a walk
 # does.
 EASE = 1.0
+# What has its own rule for a random walk, or nothing to do with one.
+EXEMPT = (*SLOW_IN_TIME, "outliers")
 
 
 @dataclass(frozen=True)
@@ -70,8 +73,23 @@ class Ranking:
 
     @property
     def significance(self) -> float:
-        """S with what each candidate needs less."""
-        return max((v + ease(k, self.walks[self.best_cell(k)]) for k, v in self.statistic.items()), default=-np.inf)
+        """S with what each candidate needs less or more."""
+        return max((v + self.eased(k) - self.more_needed(k) for k, v in self.statistic.items()), default=-np.inf)
+
+    def eased(self, name: str) -> float:
+        """Nats that a candidate needs less as the first, by the noise beside it."""
+        return ease(name, self.walks[self.best_cell(name)])
+
+    def more_needed(self, name: str) -> float:
+        """Nats that a candidate needs more: what it would lose were it known that the noise has a random walk.
+
+        A walk too weak to show still imitates what changes slowly.
+        """
+        walks = [g for g, there in self.walks.items() if there]
+        if name in EXEMPT or is_noise(name) or not walks:
+            return 0.0
+        every, among = (evidence_in(self.results, cells, self.log_prior, name) for cells in (self.results, walks))
+        return max(every - among, 0.0) if np.isfinite(among) else 0.0
 
     def best_cell(self, name: str | None = None) -> int:
         """The noise cell of most weight, with a candidate added or with none."""
@@ -110,8 +128,14 @@ class Ranking:
 
 def ease(name: str, walks: bool) -> float:
     """Nats that a candidate needs less, by whether the noise beside it has a random walk."""
-    apart = is_driver(name) or is_noise(name) or name in (*SLOW_IN_TIME, "outliers")
-    return 0.0 if walks or apart else EASE
+    return 0.0 if walks or is_driver(name) or is_noise(name) or name in EXEMPT else EASE
+
+
+def evidence_in(results: dict[int, CellResult], cells: Iterable[int], log_prior: np.ndarray, name: str) -> float:
+    """ln B of a candidate, summed over some noise cells."""
+    cells = list(cells)
+    logs = np.array([results[g].log_likelihood + log_prior[g] for g in cells])
+    return log_sum(logs + [results[g].evidence.get(name, -np.inf) for g in cells]) - log_sum(logs)
 
 
 def is_driver(name: str) -> bool:
@@ -162,12 +186,9 @@ def rank(
     )
     results = {g: everything[g] for g in cells}
     prior = scanner.grid.log_prior
-    logs = np.array([results[g].log_likelihood + prior[g] for g in cells])
-    null = log_sum(logs)
-    statistic = {}
-    for name in sorted({n for r in results.values() for n in r.evidence} - skip):
-        each = [results[g].evidence.get(name, -np.inf) for g in cells]
-        statistic[name] = log_sum(logs + np.array(each)) - null
+    null = log_sum([results[g].log_likelihood + prior[g] for g in cells])
+    names = sorted({n for r in results.values() for n in r.evidence} - skip)
+    statistic = {name: evidence_in(results, cells, prior, name) for name in names}
     # Noise beyond the statement must beat all noise within it: less than stated lacks nothing.
     within = np.array([everything[g].log_likelihood for g in families.pop("", [])])
     within_stated = max(null, log_sum(within) - np.log(len(within))) if len(within) else null

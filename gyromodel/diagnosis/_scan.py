@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
-from dataclasses import dataclass, field
 from functools import cache
 
 import numpy as np
@@ -19,6 +18,7 @@ from scipy.special import gammaln
 from threadpoolctl import ThreadpoolController
 
 from gyromodel.diagnosis._bank import Bank
+from gyromodel.diagnosis._batch import Batch, CellResult
 from gyromodel.diagnosis._cells import Cell, Cells
 from gyromodel.diagnosis._evidence import log_evidence_ratio, log_mean, log_mean_of_parts
 from gyromodel.diagnosis._lines import PEAK_WIDTH, PEAKS, Line, line_grid
@@ -44,48 +44,6 @@ ERROR_MARGIN, ERROR_DISTANCE = 8.0, 3
 @cache
 def _libraries() -> ThreadpoolController:
     return ThreadpoolController()
-
-
-@dataclass
-class CellResult:
-    """One cell's verdict on every candidate, beside its own restricted likelihood.
-
-    `explained`: what each form laid out as columns explains, by its number.
-    """
-
-    log_likelihood: float
-    rss: float
-    evidence: dict[str, float]
-    best: dict[str, tuple[int | tuple[int, ...], float, float]]
-    energy: dict[str, np.ndarray]
-    peaks: dict[int, float]
-    explained: np.ndarray = field(repr=False)
-
-
-@dataclass
-class Batch:
-    """A cell's results for several residuals: arrays have one entry a residual; `energy` is theirs in common.
-
-    `peaks` are the leading lines of a single residual: what each explains, by number of its frequency.
-    """
-
-    log_likelihood: np.ndarray
-    rss: np.ndarray
-    evidence: dict[str, np.ndarray]
-    best: dict[str, tuple[list, np.ndarray, np.ndarray]]
-    energy: dict[str, np.ndarray]
-    peaks: dict[int, float]
-    explained: np.ndarray = field(default_factory=lambda: np.zeros((0, 1)), repr=False)
-
-    def first(self) -> CellResult:
-        """The first residual's results as plain numbers."""
-        best = {
-            name: (form[0] if isinstance(form[0], tuple) else int(form[0]), float(t[0]), float(q[0]))
-            for name, (form, t, q) in self.best.items()
-        }
-        evidence = {name: float(v[0]) for name, v in self.evidence.items()}
-        log, rss = float(self.log_likelihood[0]), float(self.rss[0])
-        return CellResult(log, rss, evidence, best, self.energy, self.peaks, self.explained[:, 0])
 
 
 class Scanner:

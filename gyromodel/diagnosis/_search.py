@@ -15,7 +15,7 @@ from gyromodel.diagnosis._exchange import SLOW_LEAD, exchanged, steady, unresolv
 from gyromodel.diagnosis._forms import MAXIMUM_LINES
 from gyromodel.diagnosis._lines import lines_of
 from gyromodel.diagnosis._pairs import best_pair
-from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, ease, rank, skipped
+from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, evidence_in, rank, skipped
 from gyromodel.diagnosis._steps import EXCHANGE, Found, Steps, rows_of, standing
 from gyromodel.estimate import Estimate
 
@@ -193,8 +193,11 @@ def _together(steps: Steps, path: list[Found], estimate: Estimate, ranking: Rank
 def significant_driver(ranking: Ranking, threshold: float, runs: int) -> str | None:
     """The leading smooth driver, if it is significant; for one of time beside slow noise, over what a walk makes."""
     driver, score = ranking.best(drivers=True)
+    if driver is None:
+        return None
     like_a_walk = driver == "smooth(time)" and runs < 2 and ranking.slow_noise
-    return driver if score >= (max(threshold, TIME_MARGIN) if like_a_walk else threshold + UNLISTED) else None
+    least = max(threshold, TIME_MARGIN) if like_a_walk else threshold + UNLISTED + ranking.more_needed(driver)
+    return driver if score >= least else None
 
 
 def _before(i: int, path: list[Found], estimates: list[Estimate]) -> Selection:
@@ -216,13 +219,14 @@ def _before(i: int, path: list[Found], estimates: list[Estimate]) -> Selection:
 
 def _significant(steps: Steps, ranking: Ranking, name: str, score: float, *, first: bool) -> bool:
     """Whether a name is to be added; what would be the first needs less where no walk is beside it."""
-    if score >= steps.threshold:
+    least = steps.threshold + ranking.more_needed(name)
+    if score >= least:
         return True
-    eased = steps.threshold - ease(name, ranking.walks[ranking.best_cell(name)])
+    eased = least - ranking.eased(name)
     if score < min(eased, SLOW_LEAD):
         return False
-    if like(steps.scanner, ranking, name, SLOW_IN_TIME):
-        return _slow_structure(steps, ranking, name, score)
+    if like(steps.scanner, ranking, name, SLOW_IN_TIME) and _slow_structure(steps, ranking, name, score):
+        return True
     return first and score >= eased
 
 
@@ -231,6 +235,4 @@ def _slow_structure(steps: Steps, ranking: Ranking, name: str, score: float) -> 
     if score < SLOW_LEAD or steps.scanner.runs > 1:
         return False
     still = [g for g, walks in ranking.walks.items() if not walks]
-    logs = np.array([ranking.results[g].log_likelihood + ranking.log_prior[g] for g in still])
-    each = np.array([ranking.results[g].evidence.get(name, -np.inf) for g in still])
-    return bool(still) and log_sum(logs + each) - log_sum(logs) > steps.threshold
+    return bool(still) and evidence_in(ranking.results, still, ranking.log_prior, name) > steps.threshold

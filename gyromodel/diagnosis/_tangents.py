@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from gyromodel.diagnosis._batch import Batch
 from gyromodel.diagnosis._evidence import log_evidence_ratio
 from gyromodel.effects import Effect
-
-if TYPE_CHECKING:
-    from gyromodel.diagnosis._scan import Batch
 
 # A candidate whose columns keep less than this share of their energy beside the baseline cannot be tested.
 VANISHED = 1e-6

@@ -16,7 +16,7 @@ from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._exchange import uncontested
 from gyromodel.diagnosis._lines import lines_of
 from gyromodel.diagnosis._points import levels
-from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, ease, is_driver, is_noise
+from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, is_driver, is_noise
 from gyromodel.diagnosis._result import Cause, ParameterValue, Verdict
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import TIME_MARGIN, Selection
@@ -32,7 +32,7 @@ from gyromodel.units import factor
 
 # Share of the posterior that the credible set holds.
 CREDIBLE = 0.95
-# Where the noise has a random walk even with them, these have no edge that a walk could not make, whatever their lead.
+# Where the noise is slow even with them, these have no edge that a random walk could not make, whatever their lead.
 NO_EDGE = ("bias_drift", "bias_warmup")
 # Standard uncertainties from which on a parameter has a size.
 VAGUE = 2.0
@@ -74,13 +74,13 @@ def credible(
     apart = beside | (set() if name in ("outliers", "bias_step") else {"outliers"})
     # What explains the data worse than nothing at all is no explanation of what was found.
     own = {k: v for k, v in ranking.statistic.items() if k == name or not (v < 0.0 or is_driver(k) or k in apart)}
-    hidden_by_walk = like(scanner, ranking, name, NO_EDGE) and ranking.walks[ranking.best_cell(name)]
+    hidden = like(scanner, ranking, name, NO_EDGE) and ranking.slow[ranking.best_cell(name)]
     too_close = statistic < TIME_MARGIN and ranking.slow_noise and like(scanner, ranking, name, SLOW_IN_TIME)
     if name not in ("outliers", "bias_step", "bias_periodic") and not is_noise(name):
         # Only the number of forms and coefficients sets them apart, which is no evidence.
         own |= {k: max(own.get(k, 0.0), own[name]) for k in twins(scanner, ranking, name) - apart}
     # A drift comes back with the next run, and a step does not.
-    if (scanner.runs < 2 or name == "bias_step") and (hidden_by_walk or too_close):
+    if (scanner.runs < 2 or name == "bias_step") and (hidden or too_close):
         own["noise_random_walk"] = max(0.0, statistic - 1.0)
     top = max(own.values())
     weight = {k: float(np.exp(v - top)) for k, v in own.items()}
@@ -194,7 +194,7 @@ def judge(
         close = _close_rival(step, members)
         findings += [close] if close else []
         turn = sum(f.name == name for f in found[i:])
-        least = steps.threshold - (0.0 if i else ease(name, ranking.walks[ranking.best_cell(name)]))
+        least = steps.threshold + ranking.more_needed(name) - (0.0 if i else ranking.eased(name))
         causes.append(cause_of(scanner, extended, step, turn, ranking, members, statistic, trials, null_scores, least))
         sets.append(members)
     # Of these only something in common has a size: which of them it is, this campaign cannot tell.
@@ -229,8 +229,9 @@ def judge(
             test = "Repeat the run from power-on, everything held: noise does not come back."
         return Judgement("unknown", tuple(causes), {driver: 1.0}, driver, test, unexplained, tuple(findings))
     more = selection.last.statistic.get(selection.remains or "", -np.inf)
-    if any(c.effect == selection.remains and more > c.statistic for c in causes):
-        # The name holds less of what is there than it leaves, in a form that it cannot have.
+    least = min((c.statistic for c in causes if c.effect == selection.remains), default=strongest)
+    if causes and selection.remains != "outliers" and more > least:
+        # A name holds less of what is there than it leaves, in a form that it cannot have; or all of them do.
         driver, score = selection.last.best(drivers=True)
         driver = driver if score > steps.threshold else None
         leading = {driver or str(selection.remains): 1.0}
