@@ -25,7 +25,7 @@ from gyromodel.diagnosis import Cause
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores
 from gyromodel.diagnosis._epochs import epoch_interval
-from gyromodel.diagnosis._evidence import SIZES, explained_for, log_evidence_ratio
+from gyromodel.diagnosis._evidence import SAFE_THRESHOLD, SIZES, explained_for, log_evidence_ratio
 from gyromodel.diagnosis._forms import step_at
 from gyromodel.diagnosis._pairs import best_pair
 from gyromodel.diagnosis._ranking import EASE, ease, rank
@@ -278,6 +278,21 @@ def warming(rng: np.random.Generator) -> gm.Campaign:
         decay = np.exp(-time / tau)
         output += 40 * decay / np.linalg.norm(decay - decay.mean())
     return gm.Campaign({"time": time, "output": output}, {"time": "s", "output": "deg/h"}, {"kind": "rate"})
+
+
+@pytest.mark.parametrize(("turns", "more"), [(1.28, (0.8, 2.5)), (25.6, (0.0, 0.2))])
+def test_what_a_walk_imitates_needs_more(turns: float, more: tuple[float, float], seed: int) -> None:
+    """White noise: a walk that does not show takes from a temperature that turns once, not from one that turns often."""
+    rng = np.random.default_rng(seed)
+    plain = static_log(rng)
+    temperature = 20 + 15 * np.sin(2 * np.pi * turns * np.arange(ROWS) / ROWS)
+    campaign = plain.with_column("temperature", temperature, "degC")
+    output = plain.columns["output"] + 0.06 * temperature
+    found = gm.diagnose(
+        campaign.with_column("output", output, "deg/h"), gm.model_from_effects(["bias"]), hold_out=False
+    )
+    assert [c.effect for c in found.causes] == ["bias_temperature"]
+    assert more[0] <= found.threshold - (SAFE_THRESHOLD - EASE) <= more[1]
 
 
 @pytest.mark.long
