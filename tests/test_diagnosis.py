@@ -282,7 +282,7 @@ def warming(rng: np.random.Generator) -> gm.Campaign:
 
 @pytest.mark.parametrize(("turns", "more"), [(1.28, (0.8, 2.5)), (25.6, (0.0, 0.2))])
 def test_what_a_walk_imitates_needs_more(turns: float, more: tuple[float, float], seed: int) -> None:
-    """White noise: a walk that does not show takes from a temperature that turns once, not from one that turns often."""
+    """White noise: a walk that does not show takes from a temperature that turns once; not if it turns often."""
     rng = np.random.default_rng(seed)
     plain = static_log(rng)
     temperature = 20 + 15 * np.sin(2 * np.pi * turns * np.arange(ROWS) / ROWS)
