@@ -172,6 +172,8 @@ def _read_fixed(place: Place, effect: Effect) -> set[tuple[str, str]]:
     declared = effect.declared()
     if isinstance(place.node, yaml.SequenceNode):
         names = [item.text() for item in place.items("fixed")]
+        if absent := [name for name in names if name in declared and not np.size(getattr(effect, name))]:
+            raise place.error(f"{effect.label} has no {absent[0]} that could be fixed")
     else:
         names = {"true": list(declared), "false": []}.get(place.text().lower())
     if names is None or not set(names) <= set(declared):

@@ -373,6 +373,7 @@ BAD = [
     (entry("{effect: bias_drift, fixed: maybe}"), 4, "fixed is true, false or a list"),
     (entry("{effect: bias_drift, fixed: [pace]}"), 4, "fixed is true, false or a list"),
     (entry("{effect: scale_factor, fixed: true}"), 4, "scale_factor is fixed but has no value"),
+    (entry("{effect: table_tilt, north: 1 deg/h, fixed: [east]}"), 4, "table_tilt has no east that could be fixed"),
     (entry("{effect: scale_factor, value: 0 count/deg}"), 4, "cannot be zero"),
     (entry("{effect: scale_factor, value: 3 K}"), 4, "'3 K' is not in count/deg or count/(deg/s) or"),
     (entry("{effect: scale_factor, value: 3 count}"), 4, "not in count/deg or count/(deg/s) or"),
