@@ -513,6 +513,16 @@ def test_higher_harmonics_of_a_code_are_no_lines(rng: np.random.Generator, tmp_p
 
 
 @pytest.mark.long
+def test_a_faint_line_beside_codes_may_be_theirs() -> None:
+    """Where the period of the codes is found wrong, one of their harmonics stays as a line."""
+    built = study.build(study.Case(288060520877388, "closed_loop", "white", "bias_readout_code", 3.0))
+    campaign = gm.Campaign(built.columns, built.units, built.metadata)
+    found = gm.diagnose(campaign, gm.model_from_effects(list(built.truth.baseline)), hold_out=False)
+    assert [c.effect for c in found.causes] == ["bias_readout_code"]
+    assert any("cannot tell" in line and "bias_readout_code" in line for line in found.findings)
+
+
+@pytest.mark.long
 def test_many_gross_errors_are_given_up_together(rng: np.random.Generator) -> None:
     """More of them than the search has rounds, beside a bias over temperature."""
     wild = np.sort(rng.choice(ROWS // 5, 20, replace=False)) * 5

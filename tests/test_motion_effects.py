@@ -154,10 +154,10 @@ def test_the_bank_says_what_a_campaign_cannot_show(rng: np.random.Generator):
     assert bank.not_testable["bias_magnetic"].startswith("needs a column magnetic_field")
     assert "in steps" in bank.not_testable["time_delay"]
     # The Earth's rate alone, against gravity; a table may turn as slowly.
-    curves = {"scale_nonlinearity", "scale_sagnac_sine", "scale_spline", "saturation"}
+    curves = {"scale_nonlinearity", "scale_sagnac_sine", "scale_spline", "saturation", "rate_hysteresis"}
     for name in curves:
-        assert "no scale factor bends" in bank.not_testable[name]
-    slow = np.linspace(-20.0, 20.0, 100)
+        assert "no gyro bends" in bank.not_testable[name]
+    slow = 20.0 * np.sin(0.1 * np.arange(100.0))
     columns = {"time": np.arange(100.0), "rate": slow, "output": slow + rng.standard_normal(100)}
     table = Campaign(columns, dict.fromkeys(("rate", "output"), "deg/h") | {"time": "s"}, {"kind": "rate"})
     assert curves <= set(build_bank(read_signals(table)).names())

@@ -42,6 +42,8 @@ ROUNDED = 2.0
 FAINT, OUTDONE = 10.0, 10.0
 # Parts of an interval by which samples may be off a regular grid before they tell a line from its aliases.
 IRREGULAR = 0.01
+# What makes lines at each harmonic of a ramp, of which its form holds a few.
+CODES = "bias_readout_code"
 # Gross errors that are listed by row.
 ROWS_TOLD = 12
 # A driver that names leave with more than this share of the structure makes the discrepancy unknown.
@@ -258,15 +260,18 @@ def judge(
 
 
 def _left_by(cause: Cause, causes: Sequence[Cause], estimate: Estimate, vague: bool) -> dict[str, float]:
-    """The stronger thermal cause that may leave a faint or a vague one, by its form or a thermometer's noise.
+    """The stronger cause that may leave a faint or a vague one, by its form or a thermometer's noise.
 
-    Beside a vague one it need not be far stronger.
+    Thermal ones leave thermal ones, a converter's codes leave lines. Beside a vague one it need not be far stronger.
     """
     if (cause.statistic > FAINT and not vague) or is_noise(cause.effect):
         return {}
     needs = {e.label: set(thermometers(e.columns_needed)) for e in estimate.model.effects}
-    # A chamber's pace is a line.
-    own = set().union(*needs.values()) if cause.effect == "bias_periodic" else needs.get(cause.effect, set())
+    own = needs.get(cause.effect, set())
+    if cause.effect == "bias_periodic":
+        # A chamber's pace is a line, and so is each further harmonic of a ramp's codes.
+        needs |= {CODES: {CODES}}
+        own = set().union(*needs.values())
     least = (1.0 if vague else OUTDONE) * cause.statistic
     others = [c for c in causes if c.statistic > least and own & needs.get(c.effect, set())]
     return {max(others, key=lambda c: c.statistic).effect: 0.5} if others else {}

@@ -10,10 +10,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from gyromodel._checks import accelerations
 from gyromodel.effects._base import Effect, Signals, round_reference, setting
 
 # Powers are of (x − reference)/10, so that their coefficients have the size of the effect over ten degrees.
 POWER_SCALE = 10.0
+SLOW = 1.5e-4  # rad/s, about twice the Earth's rate
+EARTHLY = "all rates are the Earth's, in attitudes that turn against gravity: no gyro bends or sticks within them"
+
+
+def beyond_earth(signals: Signals) -> bool:
+    """Whether functions of the rate are worth looking for: not in a tumble under the Earth's rate.
+
+    There such a function follows specific force, and a gyro that bends or sticks so early would be no gyro beyond.
+    """
+    tumbles = any(np.ptp(np.asarray(signals[name])) > 0 for name in accelerations(signals))
+    return not tumbles or float(jnp.nanmax(jnp.abs(signals["rate"]))) > SLOW
 
 
 class OverTemperature(Effect):

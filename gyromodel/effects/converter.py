@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from gyromodel.effects._base import Effect, Signals, parameter, stack
-from gyromodel.effects.scale import WITHIN, may_bend
+from gyromodel.effects._shapes import EARTHLY, beyond_earth
 
 # Limits searched, as parts of the largest rate, and different rates that must lie beyond one.
 LOWEST, HIGHEST, LIMITS, FEWEST_BEYOND = 0.2, 0.99, 24, 2
@@ -38,7 +38,7 @@ class Saturation(Effect):
     test = "Leave out the largest rates: a nonlinearity bends those below as well, saturation does not."
     held = ("share",)
     positive = True
-    untested = f"has fewer than two different rates beyond any limit, or {WITHIN}"
+    untested = f"has fewer than two different rates beyond any limit, or {EARTHLY}"
 
     share: Float[Array, ""] = parameter("1", 1.0, "part of the output that saturates", default=1.0)
     limit: Float[Array, ""] = parameter("deg/s", 100.0, "largest rate that is told", linear=False, default=1.75)
@@ -58,7 +58,7 @@ class Saturation(Effect):
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
         """Limits with several rates beyond them."""
-        if not may_bend(signals):
+        if not beyond_earth(signals):
             return []
         levels = np.unique(np.round(np.abs(np.asarray(signals["rate"])), 9))
         limits = levels[-1] * np.linspace(LOWEST, HIGHEST, LIMITS)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from gyromodel.effects._base import Effect, Signals, parameter, stack
+from gyromodel.effects._shapes import EARTHLY, beyond_earth
 from gyromodel.numerics.play import play
 
 # Half widths searched, as parts of the driver's range: the widest loops are hardly more than a line over the driver.
@@ -77,6 +78,11 @@ class RateHysteresis(_Hysteresis):
     narrowest = 0.001  # a reference rate has no noise that would close such a loop
     cause = "Friction, backlash of the pick-off or magnetic remanence of the torquer keeps part of the last turn."
     test = "Oscillate at two frequencies of one rate amplitude: the loop stays as it is, that of a delay grows."
-    untested = "the rate never turns back far enough to close a loop"
+    untested = f"the rate never turns back far enough to close a loop, or {EARTHLY}"
 
     half_width: Float[Array, ""] = parameter("deg/s", 1.0, "turn that changes sides, half", linear=False, default=0.02)
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """Loops of which the campaign holds both branches, of more than the Earth's rate."""
+        return super().candidates(signals) if beyond_earth(signals) else []

@@ -11,21 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from gyromodel._checks import accelerations
 from gyromodel.effects._base import Effect, Signals, parameter, setting, stack
-from gyromodel.effects._shapes import OverTemperature, check_curve, curve_columns, curve_forms
-
-STRAIGHT = 1.5e-4  # rad/s, about twice the Earth's rate
-WITHIN = "all rates are the Earth's, in attitudes that turn against gravity: no scale factor bends within them"
-
-
-def may_bend(signals: Signals) -> bool:
-    """Whether a curve of the scale factor is worth looking for: not in a tumble under the Earth's rate.
-
-    There a power of the rate follows specific force, and a gyro that bends so early would be no gyro beyond.
-    """
-    tumbles = any(np.ptp(np.asarray(signals[name])) > 0 for name in accelerations(signals))
-    return not tumbles or float(jnp.nanmax(jnp.abs(signals["rate"]))) > STRAIGHT
+from gyromodel.effects._shapes import EARTHLY, OverTemperature, beyond_earth, check_curve, curve_columns, curve_forms
 
 
 class ScaleFactor(Effect):
@@ -78,7 +65,7 @@ class ScaleNonlinearity(Effect):
     site = "scale"
     needs = ("rate",)
     cause = "The readout electronics, the modulation depth or the table response bends the input-output curve."
-    untested = WITHIN
+    untested = EARTHLY
     test = "Run the rates in random order: self-heating at speed follows time, a nonlinearity follows rate."
 
     coefficients: Float[Array, " term"] = parameter(
@@ -113,7 +100,7 @@ class ScaleNonlinearity(Effect):
     def candidates(cls, signals: Signals) -> list[Self]:
         """Every set of powers."""
         sets = [s for r in (1, 2, 3, 4) for s in itertools.combinations((2, 3, 4, 5), r)]
-        return [cls(powers=s).prepared(signals) for s in sets] if may_bend(signals) else []
+        return [cls(powers=s).prepared(signals) for s in sets] if beyond_earth(signals) else []
 
 
 class ScaleSagnacSine(Effect):
@@ -128,7 +115,7 @@ class ScaleSagnacSine(Effect):
     cause = "An open-loop fiber-optic gyro measures the sine of the Sagnac phase, and the simulation has it linear."
     held = ("share",)
     positive = True
-    untested = WITHIN
+    untested = EARTHLY
     test = "Drive it to rates where the Sagnac phase passes 1 rad: a cubic nonlinearity parts from the sine there."
 
     share: Float[Array, ""] = parameter("1", 1.0, "part of the output that follows the sine", default=1.0)
@@ -151,7 +138,11 @@ class ScaleSagnacSine(Effect):
     def candidates(cls, signals: Signals) -> list[Self]:
         """Sagnac phases of 0.1 to 3 rad at the largest rate."""
         top = float(jnp.nanmax(jnp.abs(signals["rate"])))
-        return [cls(kappa=phase / top) for phase in np.geomspace(0.1, 3.0, 12)] if top > 0 and may_bend(signals) else []
+        return (
+            [cls(kappa=phase / top) for phase in np.geomspace(0.1, 3.0, 12)]
+            if top > 0 and beyond_earth(signals)
+            else []
+        )
 
 
 class ScaleTemperature(OverTemperature):
@@ -292,7 +283,7 @@ class ScaleSpline(Effect):
         "Repeat the rates both ways and in random order: anomalous test points and resonances do not come back alike."
     )
     supersedes = ("scale_nonlinearity",)
-    untested = f"has fewer than ten different rates, or {WITHIN}"
+    untested = f"has fewer than ten different rates, or {EARTHLY}"
 
     coefficients: Float[Array, " bend"] = parameter("ppm", 100.0, "bends, as parts of the largest rate", default=())
     knots: int = eqx.field(static=True, default=6)
@@ -338,4 +329,4 @@ class ScaleSpline(Effect):
     def candidates(cls, signals: Signals) -> list[Self]:
         """Smooth curves of five to seven knots, where there are rates enough."""
         levels = len(np.unique(np.round(np.asarray(signals["rate"]), 9)))
-        return [cls(knots=k).prepared(signals) for k in (5, 6, 7) if levels >= 2 * k and may_bend(signals)]
+        return [cls(knots=k).prepared(signals) for k in (5, 6, 7) if levels >= 2 * k and beyond_earth(signals)]
