@@ -21,8 +21,8 @@ from gyromodel.units import UnitError, convertible, factor, internal_unit, quant
 
 # A step this many times the median one separates stretches of a record.
 GAP = 10.0
-# And one this many times the median, where a run begins, is time in which the gyro was off.
-OFF = 2.0
+# And one this many times the median within runs, where a run begins, is time in which the gyro was off.
+OFF = 1.5
 # Longer records are padded less: the work outweighs the compiling.
 FINER_FROM = 4096
 # A clock is regular if most steps differ by less than this part of the median one; the others are gaps.
@@ -243,8 +243,10 @@ def _time_on(campaign: Campaign, time: np.ndarray) -> np.ndarray:
     if isinstance(value, str):
         raise CampaignError(f"{campaign.name}: metadata time_since_power_on is {value!r}, expected a number of seconds")
     runs = campaign.columns.get("run", np.zeros(len(time)))
-    step = np.diff(time)
-    begins = np.append(True, (np.diff(runs) != 0) & (step > OFF * np.median(step)))
+    step, other = np.diff(time), np.diff(runs) != 0
+    # Where each row is a run of its own, each begins with one.
+    usual = 0.0 if other.all() else np.median(step[~other])
+    begins = np.append(True, other & (step > OFF * usual))
     return time - time[np.flatnonzero(begins)][np.cumsum(begins) - 1] + float(value)
 
 

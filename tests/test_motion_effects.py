@@ -161,6 +161,8 @@ def test_the_bank_says_what_a_campaign_cannot_show(rng: np.random.Generator):
     columns = {"time": np.arange(100.0), "rate": slow, "output": slow + rng.standard_normal(100)}
     table = Campaign(columns, dict.fromkeys(("rate", "output"), "deg/h") | {"time": "s"}, {"kind": "rate"})
     assert curves <= set(build_bank(read_signals(table)).names())
+    shaken = table.with_column("acceleration_input", 1e-3 * rng.standard_normal(100), "m/s^2")
+    assert curves <= set(build_bank(read_signals(shaken)).names())
     counted = campaign_of(design, noise)
     counted = counted.with_column("acceleration_input", 1e4 * counted.columns["acceleration_input"], "count")
     bank = build_bank(read_signals(counted))

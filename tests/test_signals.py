@@ -99,6 +99,22 @@ def test_a_run_behind_a_gap_begins_with_a_power_on():
     assert on == pytest.approx(60.0 * np.array(columns["time"]) + 30.0)
 
 
+@pytest.mark.parametrize("interval", [0.1, 1 / 3, 0.3])
+@pytest.mark.parametrize("rows", [7, 50, 333])
+def test_a_missing_row_before_a_run_is_a_gap_however_time_is_rounded(interval: float, rows: int):
+    kept = np.delete(np.arange(2 * rows + 1), rows)
+    columns = {"time": interval * kept, "run": (kept > rows).astype(float), "output": np.arange(2.0 * rows)}
+    units = {"time": "s", "run": "", "output": "deg/s"}
+    on = np.asarray(read_signals(Campaign(columns, units, {"kind": "rate"})).signals["time_on"])[: 2 * rows]
+    assert on == pytest.approx(np.tile(interval * np.arange(rows), 2))
+
+
+def test_runs_of_one_row_begin_with_a_power_on_each():
+    columns = {"time": 3600.0 * np.arange(6), "run": np.arange(6.0), "output": np.arange(6.0)}
+    measured = Campaign(columns, {"time": "s", "run": "", "output": "deg/s"}, {"kind": "rate"})
+    assert not np.asarray(read_signals(measured).signals["time_on"])[:6].any()
+
+
 def test_power_on_time_must_be_a_number(rng: np.random.Generator):
     measured = campaign(np.arange(9.0), rng.standard_normal(9))
     late = Campaign(measured.columns, measured.units, {"kind": "rate", "time_since_power_on": "soon"})

@@ -7,6 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
+from gyromodel.diagnosis._apart import like
 from gyromodel.diagnosis._forms import periodic
 from gyromodel.diagnosis._lines import lines_of, near
 from gyromodel.diagnosis._misfit import unsteady_lines
@@ -31,7 +32,7 @@ def exchanged(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[lis
     while True:
         found, estimate, rankings = _chosen_again(steps, found, estimate)
         own = {i: r.statistic[found[i].name] for i, r in rankings.items() if found[i].name in r.statistic}
-        needless = [i for i, v in own.items() if v < (SLOW_LEAD if found[i].name in SLOW_IN_TIME else steps.threshold)]
+        needless = [i for i, v in own.items() if v < _least(steps, rankings[i], found[i].name)]
         if not needless or len(found) < 2:
             return found, estimate, rankings
         least = min(needless, key=lambda i: own[i])
@@ -40,6 +41,12 @@ def exchanged(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[lis
         if after is None:
             return found, estimate, rankings
         found, estimate = fewer, after
+
+
+def _least(steps: Steps, ranking: Ranking, name: str) -> float:
+    """The evidence beside all others with which an addition stays: less for what a random walk is put beside."""
+    slow = steps.scanner.runs < 2 and like(steps.scanner, ranking, name, SLOW_IN_TIME)
+    return SLOW_LEAD if slow or name in SLOW_IN_TIME else steps.least(ranking, name)
 
 
 def _chosen_again(
@@ -62,7 +69,7 @@ def _chosen_again(
             or found[i].name not in ranking.statistic
             or is_noise(name)
             or name in (found[i].name, "outliers")
-            or score < max(own + EXCHANGE, steps.threshold)
+            or score < max(own + EXCHANGE, steps.least(ranking, name))
         ):
             continue
         step = steps.step(others, base, ranking, name)

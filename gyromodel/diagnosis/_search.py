@@ -117,7 +117,7 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
         if found != before:
             ranking = steps.rank(estimates[-1], found)
             name, score = ranking.best(drivers=False, but=("bias_periodic",))
-            remains = remains or (str(name) if score >= threshold else "")
+            remains = remains or (name if name and score >= steps.least(ranking, name) else "")
     driver = significant_driver(ranking, threshold, scanner.runs)
     selection = Selection(
         estimates[-1], tuple(found), tuple(path), ranking, tuple(estimates), driver, left_out, remains, small
@@ -176,14 +176,14 @@ def _lead(steps: Steps, driver: str, path: list[Found], last: Ranking) -> float:
 def _together(steps: Steps, path: list[Found], estimate: Estimate, ranking: Ranking) -> list[tuple[Found, Estimate]]:
     """Two candidates that are significant together where none is alone, with their fits; none: there are no such."""
     pair, score = best_pair(steps.scanner, ranking)
-    if pair is None or score < steps.threshold:
+    if pair is None or score < max(steps.least(ranking, name) for name in pair):
         return []
     one = replace(steps.step(path, estimate, ranking, pair[0]), paired=True)
     first = steps.fit(standing([*path, one]))
     if first is None:
         return []
     ranking = steps.rank(first, [*path, one])
-    if ranking.statistic.get(pair[1], -np.inf) < steps.threshold:
+    if pair[1] not in ranking.statistic or ranking.statistic[pair[1]] < steps.least(ranking, pair[1]):
         return []
     other = steps.step([*path, one], first, ranking, pair[1])
     both = steps.fit(standing([*path, one, other]))
@@ -219,7 +219,7 @@ def _before(i: int, path: list[Found], estimates: list[Estimate]) -> Selection:
 
 def _significant(steps: Steps, ranking: Ranking, name: str, score: float, *, first: bool) -> bool:
     """Whether a name is to be added; what would be the first needs less where no walk is beside it."""
-    least = steps.threshold + ranking.more_needed(name)
+    least = steps.least(ranking, name)
     if score >= least:
         return True
     eased = least - ranking.eased(name)

@@ -143,6 +143,10 @@ class Steps:
         forms = self.scanner.bank.forms(name) if self.scanner.record.domain == "gyro" else []
         return len(forms) > 1 and any(not declared.linear for declared in forms[0].declared().values())
 
+    def least(self, ranking: Ranking, name: str) -> float:
+        """The evidence (ln B) that a candidate of a ranking needs."""
+        return self.threshold + ranking.more_needed(name)
+
     def step(self, found: Sequence[Found], estimate: Estimate, ranking: Ranking, name: str) -> Found:
         """A candidate of a ranking beside what was found, as one more step; of much evidence, in what fits best.
 

@@ -196,7 +196,7 @@ def judge(
         close = _close_rival(step, members)
         findings += [close] if close else []
         turn = sum(f.name == name for f in found[i:])
-        least = steps.threshold + ranking.more_needed(name) - (0.0 if i else ranking.eased(name))
+        least = steps.least(ranking, name) - (0.0 if i else ranking.eased(name))
         causes.append(cause_of(scanner, extended, step, turn, ranking, members, statistic, trials, null_scores, least))
         sets.append(members)
     # Of these only something in common has a size: which of them it is, this campaign cannot tell.
@@ -231,8 +231,10 @@ def judge(
             test = "Repeat the run from power-on, everything held: noise does not come back."
         return Judgement("unknown", tuple(causes), {driver: 1.0}, driver, test, unexplained, tuple(findings))
     more = selection.last.statistic.get(selection.remains or "", -np.inf)
-    least = min((c.statistic for c in causes if c.effect == selection.remains), default=strongest)
-    if causes and selection.remains != "outliers" and more > least:
+    # Gross errors are no cause, nor is what encoders of a platform pass for.
+    all_of_them = strongest if scanner.record.domain == "gyro" and selection.remains != "outliers" else np.inf
+    least = min((c.statistic for c in causes if c.effect == selection.remains), default=all_of_them)
+    if causes and more > least:
         # A name holds less of what is there than it leaves, in a form that it cannot have; or all of them do.
         driver, score = selection.last.best(drivers=True)
         driver = driver if score > steps.threshold else None

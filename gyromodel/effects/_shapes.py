@@ -15,7 +15,8 @@ from gyromodel.effects._base import Effect, Signals, round_reference, setting
 
 # Powers are of (x − reference)/10, so that their coefficients have the size of the effect over ten degrees.
 POWER_SCALE = 10.0
-SLOW = 1.5e-4  # rad/s, about twice the Earth's rate
+# Twice the Earth's rate (rad/s), and specific force (m/s²) that noise of an accelerometer on a table does not reach.
+SLOW, TURNED = 1.5e-4, 1.0
 EARTHLY = "all rates are the Earth's, in attitudes that turn against gravity: no gyro bends or sticks within them"
 
 
@@ -24,7 +25,7 @@ def beyond_earth(signals: Signals) -> bool:
 
     There such a function follows specific force, and a gyro that bends or sticks so early would be no gyro beyond.
     """
-    tumbles = any(np.ptp(np.asarray(signals[name])) > 0 for name in accelerations(signals))
+    tumbles = any(np.ptp(np.asarray(signals[name])) > TURNED for name in accelerations(signals))
     return not tumbles or float(jnp.nanmax(jnp.abs(signals["rate"]))) > SLOW
 
 
