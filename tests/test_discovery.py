@@ -12,10 +12,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 
+import gyromodel as gm
 from benchmarks._kept import Kept
+from gyromodel.units import factor, internal_unit
 from tests.truth import levels, study
 from tests.truth.campaigns import HOMES, MOTION, TESTABLE, known
+from tests.truth.effects import error
 from tests.truth.noise import OUTSIDE
 from tests.truth.study import SLOW
 from tests.truth.verdicts import ACCEPTED, Answer, judge
@@ -90,6 +94,37 @@ def test_uncatalogued_effects_are_unknown_and_their_driver_is_found(seed):
     cases = study.unknown_cases(UNKNOWN_3, seed, 3.0) + study.unknown_cases(UNKNOWN_10, seed + 1, 10.0)
     records = study.run_cases(cases, WORKERS)
     _require(levels.pooled(levels.unknown_levels(records)), records, seed)
+
+
+# Fast and slow effects in noise of each kind.
+DETECTABLE = (
+    ("static_cycle", "white", "bias_temperature"),
+    ("static_cycle", "flicker", "bias_supply_voltage"),
+    ("static_cycle", "random_walk", "bias_drift"),
+    ("rate_temperature", "white", "bias_drift"),
+    ("rate_temperature", "flicker", "scale_temperature"),
+    ("rate_temperature", "random_walk", "bias_temperature"),
+    ("tumble", "white", "bias_acceleration_input"),
+)
+
+
+@pytest.mark.long
+def test_sizes_said_to_be_detectable_are_found(seed):
+    """Four of five campaigns that hold an effect of the size said show it, and fewer where it is half as large."""
+    count, shown = 4 * len(DETECTABLE), {0.5: 0, 1.0: 0}
+    for i in range(count):
+        design, noise, effect = DETECTABLE[i % len(DETECTABLE)]
+        built = study.build(study.Case(seed + i, design, noise))
+        campaign = gm.Campaign(columns=built.columns, units=built.units, metadata=built.metadata)
+        model = gm.model_from_effects(list(built.truth.baseline))
+        size, unit = gm.diagnose(campaign, model, hold_out=False).minimum_detectable[effect]
+        hidden = error(effect, built.design, size * factor(unit, internal_unit(unit)), {})
+        for part in shown:
+            output = built.columns["output"] + part * hidden * factor("rad/s", built.units["output"])
+            held = gm.Campaign(columns=built.columns | {"output": output}, units=built.units, metadata=built.metadata)
+            shown[part] += gm.diagnose(held, model, hold_out=False).verdict != "adequate"
+    assert binom.cdf(shown[1.0], count, 0.8) > levels.TAIL, f"seed {seed}: {shown} of {count}"
+    assert binom.cdf(shown[0.5], count, 0.8) < levels.TAIL, f"seed {seed}: {shown} of {count}"
 
 
 def test_what_a_study_keeps_on_disk_comes_to_the_same_levels(tmp_path):

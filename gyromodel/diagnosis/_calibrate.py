@@ -17,12 +17,13 @@ import numpy as np
 
 from gyromodel import __version__
 from gyromodel._cache import cache_folder
-from gyromodel.diagnosis._ranking import EASE, EXEMPT, cells_of_weight, ease, rank, skipped, tangents
+from gyromodel.diagnosis._ranking import EASE, EXEMPT, cells_of_weight, ease, is_driver, rank, skipped, tangents
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.estimate import Estimate, filter_of
 from gyromodel.numerics.state_space import colour
 
-DRAWS_TOGETHER = 64
+# Draws searched at once, more of short records, whose values stay within so many.
+LEAST_TOGETHER, MOST_TOGETHER, VALUES_TOGETHER = 64, 256, 2**18
 # Draws are searched in the noise cells within this many nats of the best on the data: each has noise of its own.
 WITHIN = 12.0
 # Columns that a test sets; others (a supply voltage, a pressure) wander, in each campaign of a design otherwise.
@@ -39,7 +40,8 @@ def null_scores(
 ) -> np.ndarray:
     """S of each draw of the baseline's own noise, from the cache where this design has been drawn before.
 
-    S is the largest ln B, with what a name needs less or more for what a random walk makes (`Ranking.significance`).
+    S is the largest ln B of a name or of a driver, with what that needs less or more for what a random walk makes
+    (`Ranking.significance`).
 
     Args:
         scanner: the search laid out on the record.
@@ -63,24 +65,29 @@ def null_scores(
     prior = scanner.grid.log_prior[cells][:, None]
     walks = np.asarray(scanner.grid.ratios.walk)[cells] > 0
     rng = np.random.default_rng(seed)
-    scores = []
-    for start in range(0, draws, DRAWS_TOGETHER):
-        white = rng.standard_normal((DRAWS_TOGETHER, len(scanner.present)))
+    scores, rows = [], len(scanner.present)
+    together = min(max(VALUES_TOGETHER // rows, LEAST_TOGETHER), MOST_TOGETHER)
+    for start in range(0, draws, together):
+        white = rng.standard_normal((together, rows))
         drawn = np.asarray(_draw(filter, jax.numpy.asarray(white))).T
         batches = scanner.run_many(cells, columns, drawn, {}, tangents=continued)
         logs = np.stack([b.log_likelihood for b in batches]) + prior
-        names = set.intersection(*(set(b.evidence) for b in batches)) - skip
-        null, each = np.logaddexp.reduce(logs), []
-        for name in sorted(names):
+        names = sorted(set.intersection(*(set(b.evidence) for b in batches)) - skip)
+        null, each, needed = np.logaddexp.reduce(logs), [], []
+        for name in names:
             beside = logs + np.stack([b.evidence[name] for b in batches])
             evidence = np.logaddexp.reduce(beside) - null
-            own = evidence + np.where(walks[beside.argmax(axis=0)], 0.0, ease(name, False))
+            own = np.where(walks[beside.argmax(axis=0)], 0.0, ease(name, False))
             if walks.any() and name not in EXEMPT:
                 among = np.logaddexp.reduce(beside[walks]) - np.logaddexp.reduce(logs[walks])
                 own -= np.maximum(evidence - among, 0.0)
-            each.append(own)
-        scores.append(np.max(each, axis=0))
-        say("calibrating the threshold", 0.06 + 0.18 * min(1.0, (start + DRAWS_TOGETHER) / draws))
+            each.append(evidence)
+            needed.append(own)
+        drivers = np.array([is_driver(name) for name in names])
+        # Of the best name and of the best driver, as a search weighs no other.
+        tops = [np.where(kind[:, None], each, -np.inf).argmax(axis=0) for kind in (drivers, ~drivers) if kind.any()]
+        scores.append(np.max([(np.array(each) + needed)[top, np.arange(together)] for top in tops], axis=0))
+        say("calibrating the threshold", 0.06 + 0.18 * min(1.0, (start + together) / draws))
     found = np.concatenate(scores)[:draws]
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)

@@ -4,7 +4,7 @@ robust fit puts a few of them in; and which of many dwells stand apart from what
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import combinations
 from math import comb
 
@@ -112,7 +112,7 @@ def suspects(
     if most < 1:
         return [np.zeros(0, int)] * residuals.shape[1]
     fitted, data = (np.stack([x[p].mean(axis=0) for p in points]) for x in (columns, residuals))
-    orders = (robust_order(fitted, y) for y in data.T)
+    orders = robust_orders(fitted, data)
     return [_not_returning(order[: most if score >= least else 0], level) for order, score in orders]
 
 
@@ -127,28 +127,33 @@ def _not_returning(order: np.ndarray, level: np.ndarray) -> np.ndarray:
     return order
 
 
-def robust_order(columns: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float]:
-    """Points by how anomalous they are beside the fit of least median misfit, and the first's, in robust deviations.
+def robust_orders(columns: np.ndarray, data: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:
+    """Of each data set, points by how anomalous they are beside the fit of least median misfit; the first's misfit.
 
     Fits go through as few points as determine them: anomalous points cannot mask one another in one through good ones.
 
     Args:
         columns: what is fitted, at each point.
-        y: data at each point.
+        data: at each point, one set a column.
+
+    Yields:
+        The points' numbers, none where they are too few, and the first's misfit in robust standard deviations.
     """
     u, size, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
     u = u[:, size > 1e-9]
     n, p = u.shape
     if n < 2 * p:
-        return np.zeros(0, int), 0.0
+        yield from [(np.zeros(0, int), 0.0)] * data.shape[1]
+        return
     if comb(n, p) <= FITS:
         through = np.array(list(combinations(range(n), p)), int)
     else:
         through = np.random.default_rng(0).integers(n, size=(FITS, p))
     sound = np.abs(np.linalg.det(u[through]))
     through = through[sound >= SOUND * sound.max()]
-    misfit = np.abs(y - np.linalg.solve(u[through], y[through][..., None])[..., 0] @ u.T)
-    half = p + (n - p) // 2
-    median = np.partition(misfit, half, axis=1)[:, half]
-    best = int(np.argmin(median))
-    return np.argsort(-misfit[best]), float(misfit[best].max() / max(1.4826 * median[best], 1e-300))
+    solved, half = np.linalg.inv(u[through]), p + (n - p) // 2
+    for y in data.T:
+        misfit = np.abs(y - (solved @ y[through][..., None])[..., 0] @ u.T)
+        median = np.partition(misfit, half, axis=1)[:, half]
+        best = int(np.argmin(median))
+        yield np.argsort(-misfit[best]), float(misfit[best].max() / max(1.4826 * median[best], 1e-300))

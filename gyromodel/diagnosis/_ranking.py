@@ -73,8 +73,9 @@ class Ranking:
 
     @property
     def significance(self) -> float:
-        """S with what each candidate needs less or more."""
-        return max((v + self.eased(k) - self.more_needed(k) for k, v in self.statistic.items()), default=-np.inf)
+        """S of what a search would add, or of the best driver, with what that needs less or more."""
+        tops = [top for drivers in (False, True) if (top := self.best(drivers=drivers)[0])]
+        return max((self.statistic[k] + self.eased(k) - self.more_needed(k) for k in tops), default=-np.inf)
 
     def eased(self, name: str) -> float:
         """Nats that a candidate needs less as the first, by the noise beside it."""
@@ -86,10 +87,14 @@ class Ranking:
         A walk too weak to show still imitates what changes slowly.
         """
         walks = [g for g, there in self.walks.items() if there]
-        if name in EXEMPT or is_noise(name) or not walks:
+        if not self.needs_a_walk(name):
             return 0.0
         every, among = (evidence_in(self.results, cells, self.log_prior, name) for cells in (self.results, walks))
         return max(every - among, 0.0) if np.isfinite(among) else 0.0
+
+    def needs_a_walk(self, name: str) -> bool:
+        """Whether a candidate has to show beside noise with a random walk as well."""
+        return any(self.walks.values()) and name not in EXEMPT and not is_noise(name)
 
     def best_cell(self, name: str | None = None) -> int:
         """The noise cell of most weight, with a candidate added or with none."""

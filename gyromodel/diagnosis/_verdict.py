@@ -24,6 +24,7 @@ from gyromodel.diagnosis._shapes import remaining
 from gyromodel.diagnosis._steps import Found, Steps
 from gyromodel.diagnosis._variance import quantum
 from gyromodel.effects import Effect
+from gyromodel.effects._shapes import beyond_earth
 from gyromodel.effects.drivers import BiasPeriodic, BiasStep
 from gyromodel.estimate import Estimate
 from gyromodel.model import effect_class
@@ -410,7 +411,7 @@ def _as_set(cause: Cause, members: dict[str, float]) -> tuple[Cause, ...]:
 
 def _unrepeated(scanner: Scanner, bad: np.ndarray) -> bool:
     """Whether some anomalous point's rate has fewer than two good points, so that a curve through it is possible."""
-    if "rate" not in scanner.record.signals:
+    if "rate" not in scanner.record.signals or not beyond_earth(scanner.record.signals):
         return False
     level = levels(scanner.record, scanner.points)
     return any(np.sum(level[~bad] == own) < 2 for own in level[bad])
