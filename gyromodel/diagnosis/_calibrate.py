@@ -66,7 +66,9 @@ def null_scores(
     walks = np.asarray(scanner.grid.ratios.walk)[cells] > 0
     rng = np.random.default_rng(seed)
     scores, rows = [], len(scanner.present)
-    together = min(max(VALUES_TOGETHER // rows, LEAST_TOGETHER), MOST_TOGETHER)
+    together = min(
+        max(VALUES_TOGETHER // rows, LEAST_TOGETHER), MOST_TOGETHER, -(-draws // LEAST_TOGETHER) * LEAST_TOGETHER
+    )
     for start in range(0, draws, together):
         white = rng.standard_normal((together, rows))
         drawn = np.asarray(_draw(filter, jax.numpy.asarray(white))).T
