@@ -461,6 +461,7 @@ def test_several_lines_are_one_cause(rng: np.random.Generator) -> None:
     assert frequency == pytest.approx([0.0031, 0.0117], abs=tolerance)
 
 
+@pytest.mark.long
 def test_a_further_line_is_contested_by_its_other_names(rng: np.random.Generator) -> None:
     """At a constant rate an error of the ramp's codes is a line; one that is nothing else stands beside it."""
     time = 0.1 * np.arange(3000)
@@ -482,7 +483,9 @@ WEAK = [
 ]
 
 
-@pytest.mark.parametrize("case", WEAK, ids=lambda case: case.effect)
+@pytest.mark.parametrize(
+    "case", [WEAK[0], *(pytest.param(c, marks=pytest.mark.long) for c in WEAK[1:])], ids=lambda case: case.effect
+)
 def test_a_name_is_the_same_only_as_what_holds_its_signal(case: study.Case) -> None:
     answer = study.run_engine(study.build(case))
     assert answer.verdict == "named"
@@ -558,7 +561,7 @@ def test_a_bias_is_no_step_at_the_end_of_the_record() -> None:
     assert [c.effect for c in found.causes] == ["bias"]
 
 
-@pytest.mark.parametrize("slow", [0.0, 0.02])
+@pytest.mark.parametrize("slow", [pytest.param(0.0, marks=pytest.mark.long), 0.02])
 def test_two_effects_that_all_but_cancel_are_both_named(slow: float) -> None:
     rng, rows = np.random.default_rng(4), 1000
     window = np.hanning(150)

@@ -75,6 +75,7 @@ def test_scores_equal_dense_algebra(rng: np.random.Generator, walk: float):
     assert errors == pytest.approx(residual[rows])
 
 
+@pytest.mark.long
 def test_what_one_block_alone_determines_is_not_cut(rng: np.random.Generator):
     """The error on blocks left out rises with both leans, as the others leave each of them open."""
     found = gm.diagnose(log(rng), gm.model_from_effects(["scale_factor", "bias"]))
@@ -88,6 +89,7 @@ def test_what_one_block_alone_determines_is_not_cut(rng: np.random.Generator):
         assert abs(parameter.value - lean) < 5 * parameter.std < abs(lean)
 
 
+@pytest.mark.long
 def test_values_beside_what_was_cut_say_so(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch):
     """A cut by force: the coefficient over temperature takes up a part of the leans, and what it would be is told."""
     forced = lambda record, estimate: (p := float(len(estimate.model.slots())), -p, False)  # noqa: E731

@@ -196,6 +196,7 @@ def test_one_axis_of_three_is_to_be_named(rng: np.random.Generator) -> None:
         gm.diagnose(alone, gm.model_from_effects(["bias"]))
 
 
+@pytest.mark.long
 def test_a_bias_over_the_speed_of_temperature_whatever_its_sign_is_unknown(rng: np.random.Generator) -> None:
     time = 30.0 * np.arange(1440)
     hours = [0, 1, 2, 3.33, 5, 6.67, 7.78, 9.44, 10, 12]
@@ -318,7 +319,7 @@ def test_anomalous_dwells_measured_once_are_points_or_a_curve(bad: int, shift: f
     assert found.next_test.startswith("Repeat the points at")
 
 
-@pytest.mark.parametrize(("bad", "shift"), [(2, 20.0), (4, 6.0)])
+@pytest.mark.parametrize(("bad", "shift"), [pytest.param(2, 20.0, marks=pytest.mark.long), (4, 6.0)])
 def test_anomalous_dwells_are_given_up_where_other_visits_are_good(bad: int, shift: float) -> None:
     drawn = rate_table(np.random.default_rng(bad), bad, shift, visits=4)
     found = gm.diagnose(drawn, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
@@ -326,6 +327,7 @@ def test_anomalous_dwells_are_given_up_where_other_visits_are_good(bad: int, shi
     assert any(line.startswith(f"{bad} whole dwells, which begin") for line in found.findings)
 
 
+@pytest.mark.long
 def test_a_curve_visited_twice_is_no_set_of_dwells() -> None:
     drawn = rate_table(np.random.default_rng(0), 0, 0.0, visits=2, wave=10.0)
     found = gm.diagnose(drawn, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
@@ -348,6 +350,7 @@ def late_thermometer(
     return campaign(columns.pop("output"), columns.pop("time"), **columns)
 
 
+@pytest.mark.long
 def test_what_grew_from_another_effect_is_not_exchanged_for_it():
     """A late thermometer beside another cause, an example with a fixed seed: left out, its bias curve goes with it."""
     measured = late_thermometer(np.random.default_rng(1), curve=0.03, lag=150.0, supply=2.0)

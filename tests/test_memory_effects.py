@@ -187,7 +187,7 @@ def test_a_coil_follows_the_thermometer_through_its_lags(lags: tuple[float, ...]
 
 
 @pytest.mark.parametrize("effect", ["bias_temperature_rate", "bias_temperature_product"])
-@pytest.mark.parametrize("steps", [8.0, 24.0])
+@pytest.mark.parametrize("steps", [pytest.param(8.0, marks=pytest.mark.long), 24.0])
 def test_a_coil_late_by_many_samples_has_no_other_name(effect: str, steps: float, monkeypatch: pytest.MonkeyPatch):
     """A strong Shupe effect of a coil that heat diffuses into: what its lag leaves must not be named as well."""
     monkeypatch.setitem(SHAPES, effect, lambda design, rng: {"tau": steps * design.step})
@@ -237,6 +237,7 @@ def test_a_clipped_output_is_saturation():
     assert told.value == pytest.approx(np.rad2deg(limit), abs=max(5 * told.std, 1e-3))
 
 
+@pytest.mark.long
 def test_an_output_that_ends_has_its_errors_before_the_end():
     """Bias and scale move the rate at which a converter ends, not what it tells there."""
     rng = np.random.default_rng(EXAMPLE)

@@ -71,6 +71,7 @@ def test_the_named_effect_put_back_leaves_nothing(first: Diagnosis):
     assert diagnosed(given.with_column("output", output, "deg/s")).verdict == "adequate"
 
 
+@pytest.mark.long
 def test_a_larger_effect_never_ranks_lower():
     ranks = []
     for size in SIZE * 0.0125 * 2.0 ** np.arange(4):

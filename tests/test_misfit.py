@@ -37,7 +37,10 @@ def comes_and_goes(t: np.ndarray) -> np.ndarray:
     return 2.0 * ((t > 350) & (t < 500)) * np.sin(2 * np.pi * 0.08 * t)
 
 
-@pytest.mark.parametrize("wave", [wanders, decays, comes_and_goes])
+@pytest.mark.parametrize(
+    "wave",
+    [wanders, pytest.param(decays, marks=pytest.mark.long), pytest.param(comes_and_goes, marks=pytest.mark.long)],
+)
 def test_what_changes_is_no_line(wave: Callable[[np.ndarray], np.ndarray], rng: np.random.Generator) -> None:
     found = gm.diagnose(log(5 + wave(TIME) + 0.5 * rng.normal(size=ROWS)), gm.model_from_effects(["bias"]))
     assert any("no steady line" in line for line in found.findings)
@@ -65,6 +68,7 @@ def test_a_steady_line_is_never_said_to_change(walk: float, rng: np.random.Gener
         assert unsteady_lines(fit_record(read_signals(log(line + noise)), model)) == [False]
 
 
+@pytest.mark.long
 def test_the_band_of_what_sweeps_is_told_of_and_noise_alone_has_none(rng: np.random.Generator) -> None:
     """A chirp from 0.1 to 0.14 Hz; noise of its own in each of 20 logs, beside it or alone.
 

@@ -248,7 +248,10 @@ def test_white_noise_shows_no_other(rng: np.random.Generator):
     assert binom.sf(shown - 1, 12, 0.05) > RARE
 
 
-@pytest.mark.parametrize(("kind", "other"), [("flicker", "noise_random_walk"), ("random_walk", "noise_flicker")])
+@pytest.mark.parametrize(
+    ("kind", "other"),
+    [pytest.param("flicker", "noise_random_walk", marks=pytest.mark.long), ("random_walk", "noise_flicker")],
+)
 def test_strong_noise_is_told_by_its_colour(kind: str, other: str, rng: np.random.Generator):
     """One hundred times the white variance at the record's length: of 200 draws 90 % (flicker) and 97 % (walk) are."""
     record, model = with_rows(ROWS), model_from_effects(["bias"])

@@ -170,6 +170,7 @@ def test_kinds_of_noise_that_are_not_stated_are_causes():
         assert any(sentence in line for line in (*free.findings, ""))
 
 
+@pytest.mark.long
 def test_a_ripple_at_one_end_of_a_column_is_told_beside_the_noise(rng: np.random.Generator):
     """A sine of 1 °C period is no function that is searched, and scatters like noise of the hot end."""
     time = STEP * np.arange(ROWS)

@@ -82,7 +82,9 @@ def test_another_loop_is_named_where_the_friction_is_known(seed: int):
     assert compliance == pytest.approx(1.05 / (0.6 * 1.118) - 1, abs=5 * std + 0.03)
 
 
-@pytest.mark.parametrize("known", [False, True], ids=["no friction", "known friction"])
+@pytest.mark.parametrize(
+    "known", [pytest.param(False, marks=pytest.mark.long), True], ids=["no friction", "known friction"]
+)
 def test_nothing_hidden_is_adequate(known: bool):
     """Without friction, or with the simulation's own; of fresh seeds the benchmark tells."""
     log = vibration("loop_dynamics" if known else "", 0.0, seed=1)
@@ -116,6 +118,7 @@ def test_friction_that_sticks_has_no_other_name(seed: int):
     assert (diagnosis.verdict, [c.effect for c in diagnosis.causes]) == ("named", ["shaft_friction"])
 
 
+@pytest.mark.long
 def test_an_axis_that_nothing_explains_moves_no_value():
     """In the embedded log the redundant gimbal sticks: with the runs about Y the delay is 2.0089 ± 0.0014 ms, not 2."""
     log = read_campaign(files("gyromodel") / "data" / "platform_vibration.csv.gz")
@@ -129,6 +132,7 @@ def test_an_axis_that_nothing_explains_moves_no_value():
     assert not unexplained_axes(diagnosis.extended)
 
 
+@pytest.mark.long
 def test_probabilities_of_axes_are_uniform_where_all_is_explained(seed: int):
     found = [axis_probabilities(fit_vibration(vibration(seed=seed + k), NOTHING)) for k in range(20)]
     values = np.array([list(of.values()) for of in found]).ravel()
@@ -138,6 +142,7 @@ def test_probabilities_of_axes_are_uniform_where_all_is_explained(seed: int):
     assert unexplained_axes(late)
 
 
+@pytest.mark.long
 def test_steps_of_encoders_are_no_friction():
     """What rounding makes of a motion would be friction of a negative size."""
     diagnosis = found(in_steps(2**20, seed=1))
@@ -153,6 +158,7 @@ def test_gimbals_that_follow_the_earth_do_not_oscillate():
     assert np.flatnonzero(size[begins] > 0).tolist() == [2, 5, 8, 11]
 
 
+@pytest.mark.long
 def test_one_frequency_about_one_axis_cannot_tell():
     """X alone at the highest frequency: friction of some loop turns its phase as a delay does, and both are told of.
 
@@ -203,6 +209,7 @@ def test_units_do_not_matter(seed: int):
     assert [row.value for row in one.table()] == pytest.approx([3.0, 4.0], abs=5 * one.table()[0].std)
 
 
+@pytest.mark.long
 def test_the_command_writes_what_it_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str], seed: int):
     gyromodel.write_campaign(vibration("sync_delay", 0.03 * MS, seed), tmp_path / "log.csv")
     (tmp_path / "platform.yaml").write_text("gyro: fog-platform\neffects: []\n", encoding="utf-8")

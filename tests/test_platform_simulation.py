@@ -212,6 +212,7 @@ def log(late: float, gyros: bool, seed: int) -> gyromodel.Campaign:
     return simulate_vibration_test(Ours(), *TEST, 4.0, bench, skip=0.4, seed=seed)
 
 
+@pytest.mark.long
 def test_the_commands_name_what_was_simulated(seed: int):
     diagnosis = gyromodel.diagnose(log(0.002, False, seed), model_from_effects([]), hold_out=False)
     assert {cause.effect for cause in diagnosis.causes} == {"sync_delay", "shaft_friction"}

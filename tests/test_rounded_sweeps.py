@@ -23,6 +23,7 @@ def sweep(rng: np.random.Generator, *, line: np.ndarray | float = 0.0, step: flo
     return gm.diagnose(campaign, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
 
 
+@pytest.mark.long
 def test_lines_of_rounding_are_not_named_a_periodic_bias(rng: np.random.Generator):
     """Samples every quarter of a step, on the way up as on the way down."""
     found = sweep(rng, step=0.05)
@@ -38,6 +39,7 @@ def test_a_line_larger_than_rounding_makes_is_named(rng: np.random.Generator):
     assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["bias_periodic"])
 
 
+@pytest.mark.long
 def test_lines_that_a_fit_moves_together_are_not_named(rng: np.random.Generator):
     """A line that wanders over forty times the resolution; whatever is named has lines that the record resolves."""
     time = np.arange(float(ROWS))

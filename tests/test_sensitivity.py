@@ -474,6 +474,7 @@ def test_the_command_writes_what_it_prints(files: Path, capsys: pytest.CaptureFi
     assert again["outcomes"] == written["outcomes"]
 
 
+@pytest.mark.long
 def test_a_test_plan_is_best_for_what_was_asked(files: Path, capsys: pytest.CaptureFixture[str]):
     """For the first outcome where one is named; three units alike, as navigation needs them, are each measured."""
     text = PLAN.replace("kind: rate", "kind: rate\nlatitude_deg: 50").replace(

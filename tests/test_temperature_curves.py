@@ -42,6 +42,7 @@ def test_one_hinge_is_found_as_one_with_an_interval_of_its_place(rng: np.random.
     assert sizes["breakpoints"][1] < 1.0
 
 
+@pytest.mark.long
 def test_shapes_that_stay_as_searched_are_told_of(rng: np.random.Generator):
     """A jump between two soaks: where in between, nothing tells."""
     temperature = np.repeat([-30.0, -10.0, 10.0, 30.0, 50.0], 60) + 0.1 * rng.uniform(-1, 1, 300)
@@ -57,7 +58,7 @@ def thermistor(kelvin: np.ndarray, beta: float) -> np.ndarray:
     return 10.0 * np.exp(beta * (1.0 / kelvin - 1.0 / 298.15))
 
 
-@pytest.mark.parametrize("independent", [False, True])
+@pytest.mark.parametrize("independent", [pytest.param(False, marks=pytest.mark.long), True])
 def test_a_curve_may_be_that_of_the_thermistor_its_temperature_is_computed_from(
     independent: bool, rng: np.random.Generator
 ):

@@ -78,6 +78,7 @@ def offset_fits(found: VibrationTest) -> bool:
     return "time offset" in rows and abs(rows["time offset"].value - 1e3 * LATE) < 4 * rows["time offset"].std
 
 
+@pytest.mark.long
 def test_too_few_runs_name_nothing_and_say_what_to_do():
     log = read_campaign(LOG)
     found = vibration_test(log.select(np.isin(log.columns["segment"], [2, 3, 6, 7])))

@@ -208,6 +208,7 @@ def explained(rng: np.random.Generator, passed: Callable[[float], complex]) -> d
     return _explained(found, integrated=False)
 
 
+@pytest.mark.long
 def test_an_isolator_is_no_time_offset(rng: np.random.Generator):
     """60 rad/s, damped against the table by 0.1 of critical."""
     natural, damping = 60.0, 0.1
@@ -232,6 +233,7 @@ def test_an_isolator_is_no_time_offset(rng: np.random.Generator):
     assert abs(late.value) < 5 * late.std
 
 
+@pytest.mark.long
 def test_a_delay_is_no_friction_that_no_loop_would_hold(rng: np.random.Generator):
     """With a corner far above all frequencies friction delays by c/(J ω_c ω_i) and does nothing else."""
     explanations = explained(rng, lambda w: np.exp(-2e-3j * w))
@@ -287,6 +289,7 @@ def run(arguments: list[str]) -> int:
     return int(done.value.code or 0)
 
 
+@pytest.mark.long
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert run([str(LOG), "-o", str(tmp_path / "out"), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
