@@ -377,6 +377,40 @@ def test_sizes_are_told_of_the_parameter_that_has_a_value():
     assert magnetic == (pytest.approx(tilt[0], rel=0.5), "deg/h")
 
 
+def test_sizes_said_to_be_detectable_are_some_standard_uncertainties():
+    """ln B reaches 3 or 4 at some 3.5 to 4.5 of least squares in white noise, and 0.84 more are 80 % of campaigns."""
+    rng, time = np.random.default_rng(2), np.arange(ROWS) * 1.0
+    temperature = 25 + 10 * np.sin(2 * np.pi * time / 20)
+    found = gm.diagnose(
+        campaign(rng.standard_normal(ROWS), temperature=temperature), gm.model_from_effects(["bias"]), hold_out=False
+    )
+    size, unit = found.minimum_detectable["bias_temperature"]
+    assert unit == "deg/h/degC"
+    assert 4.0 < size * np.linalg.norm(temperature - temperature.mean()) < 5.8
+
+
+def test_what_so_few_points_show_at_no_size_is_said_to_be_untestable():
+    rate = np.array([0.0, 30.0, 70.0, 100.0])
+    columns = {"time": 60.0 * np.arange(4), "rate": rate, "output": 1.001 * rate + np.array([0.1, 0.09, 0.11, 0.1])}
+    units = {"time": "s", "rate": "deg/s", "output": "deg/s"}
+    found = gm.diagnose(
+        gm.Campaign(columns, units, {"kind": "rate"}), gm.model_from_effects(["scale_factor", "bias"]), hold_out=False
+    )
+    assert found.not_testable["bias_step"] == "too few samples: no size of it would be told"
+    assert "bias_step" not in found.minimum_detectable
+
+
+@pytest.mark.parametrize("apart", [4.4e-4, 4.6e-4, 4.8e-4])
+def test_sizes_of_what_vanishes_in_some_noise_are_those_of_the_other(apart: float):
+    """A temperature that is a ramp but for so little that in some noise a drift takes its curve up wholly."""
+    time = 10.0 * np.arange(300)
+    temperature = 20 + 0.01 * time + 30 * apart * np.sin(time / 300)
+    columns = {"time": time, "temperature": temperature, "output": 1 + 0.01 * np.random.default_rng(0).normal(size=300)}
+    log = gm.Campaign(columns, {"time": "s", "temperature": "degC", "output": "deg/h"}, {"kind": "rate"})
+    found = gm.diagnose(log, gm.model_from_effects(["bias", "bias_drift"]), hold_out=False)
+    assert 1e-3 < found.minimum_detectable["bias_temperature_curve"][0] < 0.1
+
+
 def test_fits_of_more_parameters_pay_for_each():
     """Ordinary least squares in white noise: −½ n ln RSS − ½ p ln n, up to one constant."""
     rng = np.random.default_rng(1)

@@ -42,7 +42,6 @@ def test_one_hinge_is_found_as_one_with_an_interval_of_its_place(rng: np.random.
     assert sizes["breakpoints"][1] < 1.0
 
 
-@pytest.mark.long
 def test_shapes_that_stay_as_searched_are_told_of(rng: np.random.Generator):
     """A jump between two soaks: where in between, nothing tells."""
     temperature = np.repeat([-30.0, -10.0, 10.0, 30.0, 50.0], 60) + 0.1 * rng.uniform(-1, 1, 300)

@@ -17,6 +17,7 @@ import numpy as np
 
 from gyromodel import __version__
 from gyromodel._cache import cache_folder
+from gyromodel.diagnosis._drivers import RESPONSE_DRIVER
 from gyromodel.diagnosis._ranking import EASE, EXEMPT, cells_of_weight, ease, is_driver, rank, skipped, tangents
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.estimate import Estimate, filter_of
@@ -31,6 +32,9 @@ SET = ("rate", "temperature", "acceleration", "azimuth", "table", "magnetic", "v
 # Parts of a record whose means are a column's course, and how far courses (in their own spread), lengths, intervals (as
 # parts) and noise (in quarters of a decade) may lie apart in one design.
 COURSE, SAME = 32, 0.1
+
+# Counts the rules by which draws have been scored: those kept by an earlier one do not serve.
+RULE = 2
 
 _draw = jax.jit(jax.vmap(colour, in_axes=(None, 0)))
 
@@ -85,6 +89,10 @@ def null_scores(
                 own -= np.maximum(evidence - among, 0.0)
             each.append(evidence)
             needed.append(own)
+        if {"bias_periodic", RESPONSE_DRIVER} <= set(names):
+            # Lines that any response to the motion explains better are not what a search would add (`Ranking.best`).
+            line = names.index("bias_periodic")
+            each[line] = np.where(each[names.index(RESPONSE_DRIVER)] > each[line], -np.inf, each[line])
         drivers = np.array([is_driver(name) for name in names])
         # Of the best name and of the best driver, as a search weighs no other.
         tops = [np.where(kind[:, None], each, -np.inf).argmax(axis=0) for kind in (drivers, ~drivers) if kind.any()]
@@ -104,8 +112,8 @@ def _design(scanner: Scanner, baseline: Estimate, draws: int, seed: int) -> tupl
     """A digest of what must be the same for draws to serve, and the course of what may differ a little."""
     record, bank = scanner.record, scanner.bank
     searched = [*((b.name, b.structure) for b in bank.blocks if b.kind == "effect"), *bank.scans]
-    same = (__version__, EASE, EXEMPT, baseline.model.labels, sorted(baseline.model.fixed), scanner.stated, draws, seed,
-            searched, scanner.runs)  # fmt: skip
+    same = (__version__, RULE, EASE, EXEMPT, baseline.model.labels, sorted(baseline.model.fixed), scanner.stated, draws,
+            seed, searched, scanner.runs)  # fmt: skip
     columns = []
     for name in sorted(n for n in record.signals if n.startswith(SET)):
         values = np.asarray(record.signals[name])[: record.rows]

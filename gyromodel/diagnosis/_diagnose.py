@@ -230,14 +230,15 @@ def diagnose(
     before, after = (np.asarray(e.model.predict(record.signals))[: record.rows] for e in (baseline, extended))
     slopes = [np.asarray(e.model.slope(record.signals))[: record.rows] for e in (baseline, extended)]
     output = np.where(record.present, np.asarray(record.signals["output"])[: record.rows], np.nan)
+    sizes = minimum_detectable(session.scanner, selection.last, session.threshold, unit, first=not selection.found)
     return Diagnosis(
         verdict=judgement.verdict,
         causes=judgement.causes,
         driver=driver,
         gain=gain,
         next_test=next_test,
-        minimum_detectable=minimum_detectable(session.scanner, selection.last, session.threshold, unit),
-        not_testable=not_testable(session.scanner, selection.last, selection.estimate.model),
+        minimum_detectable=sizes,
+        not_testable=not_testable(session.scanner, selection.last, selection.estimate.model, sizes),
         noise=extended.noise_table(),
         noise_kinds={} if baseline.noise_given else noise_kinds(session.scanner, selection.last),
         rounds=_rounds(session, selection, scale, hold_out),

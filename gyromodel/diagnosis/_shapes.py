@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from gyromodel.diagnosis._apart import columns_of_best
@@ -96,18 +98,25 @@ def _nearest(ranking: Ranking, driver: str, explained: float) -> tuple[str, floa
     return name, float(min(share, 1.0)), float(behind)
 
 
-def minimum_detectable(scanner: Scanner, ranking: Ranking, threshold: float, unit: str) -> dict[str, tuple[float, str]]:
-    """Size of each searched effect that would have been found with 80 % probability, at the noise of the final fit."""
+def minimum_detectable(
+    scanner: Scanner, ranking: Ranking, threshold: float, unit: str, *, first: bool
+) -> dict[str, tuple[float, str]]:
+    """Size of each searched effect that would have been found with 80 % probability, at the noise of the final fit.
+
+    Those are left out that too few samples show at no size; `first` where nothing was found.
+    """
     sizes: dict[str, tuple[float, str]] = {}
     widths = {b.name: b for b in reversed(scanner.bank.blocks)}
     for name, energy in ranking.results[ranking.best_cell()].energy.items():
-        if is_driver(name) or name == "outliers" or not (energy > 0).any():
+        if not _is_sized(name, energy):
             continue
         q = widths[name].width if name in widths else (2 if name == "bias_periodic" else 1)
         # What continues an effect begins with the column that counts.
         order = np.argsort(np.where(energy > 0, energy, np.inf))
         form = 0 if name in ranking.tangents else int(order[(energy > 0).sum() // 2])
-        size = _detectable(ranking, name, form, threshold + np.log(np.sum(energy > 0)), q)
+        size = _detectable(ranking, name, form, threshold + np.log(np.sum(energy > 0)), q, first=first)
+        if size is None:
+            continue
         if name in ranking.tangents:
             kind = ranking.tangents[name].effect
             unit_of = [p.unit for p in kind.declared().values() if not p.linear][-1]
@@ -117,24 +126,31 @@ def minimum_detectable(scanner: Scanner, ranking: Ranking, threshold: float, uni
     return sizes
 
 
-def _detectable(ranking: Ranking, name: str, form: int, least: float, q: int) -> float:
-    """Size of one form at which its evidence reaches what is needed in 80 % of campaigns.
+def _is_sized(name: str, energy: np.ndarray) -> bool:
+    """Whether a candidate has sizes, by the energy of its forms."""
+    return not is_driver(name) and name != "outliers" and bool((energy > 0).any())
+
+
+def _detectable(ranking: Ranking, name: str, form: int, least: float, q: int, *, first: bool) -> float | None:
+    """Size of one form at which its evidence reaches what is needed in 80 % of campaigns; None where none does.
 
     Of data that hold it, any noise cell leaves more unexplained: noise that imitates it gains on the others.
 
     Args:
-        ranking: with nothing found.
+        ranking: beside what was found.
         name: of the candidate.
         form: number of its form.
         least: ln B of the form that is needed, beside noise with a random walk.
         q: its columns.
+        first: whether it would be the first name, which needs less beside noise without a walk.
     """
-    cells = list(ranking.results)
+    # A cell that sees nothing of the form cannot tell it from nothing, however large.
+    cells = [g for g in ranking.results if ranking.results[g].energy[name][form] > 0]
     logs = np.array([ranking.results[g].log_likelihood + ranking.log_prior[g] for g in cells])
     rss = np.array([ranking.results[g].rss for g in cells])
     energy = np.array([ranking.results[g].energy[name][form] for g in cells])
     walks, nu = np.array([ranking.walks[g] for g in cells]), ranking.samples - ranking.baseline_columns.shape[1]
-    among = [walks] if ranking.needs_a_walk(name) else []
+    among = [walks] if ranking.needs_a_walk(name) and walks.any() else []
 
     def margin(size: float) -> tuple[float, int]:
         explained = size**2 * energy
@@ -142,11 +158,13 @@ def _detectable(ranking: Ranking, name: str, form: int, least: float, q: int) ->
         beside = alone + log_evidence_ratio(explained, rss + explained, nu, q)
         ratio = min(log_sum(beside[c]) - log_sum(alone[c]) for c in (np.ones_like(walks), *among))
         best = int(beside.argmax())
-        return ratio + ease(name, bool(walks[best])) - least, best
+        return ratio + (ease(name, bool(walks[best])) if first else 0.0) - least, best
 
-    deviation = np.sqrt(rss / nu / np.maximum(energy, 1e-300))
+    deviation = np.sqrt(rss / nu / energy)
     low, high = 0.0, float(deviation.min())
-    while margin(high)[0] < 0.0 and high < BEYOND * deviation.min():
+    while margin(high)[0] < 0.0:
+        if high > BEYOND * deviation.min():
+            return None
         low, high = high, 2.0 * high
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
@@ -163,12 +181,17 @@ def _in_unit(scanner: Scanner, name: str, effect: Effect | None, q: int, size: f
     return size * factor(internal_unit(declared), declared), declared
 
 
-def not_testable(scanner: Scanner, ranking: Ranking, model: GyroModel) -> dict[str, str]:
-    """Candidates that a campaign cannot show, wholly or in part, and those that vanish beside a model, with reasons."""
+def not_testable(scanner: Scanner, ranking: Ranking, model: GyroModel, sized: Iterable[str]) -> dict[str, str]:
+    """Candidates that a campaign cannot show, wholly or in part, and those that vanish beside a model, with reasons.
+
+    `sized` are those of which some size would have been found.
+    """
     result = ranking.results[ranking.best_cell()]
     tried = {b.name for b in scanner.bank.blocks if b.kind == "effect"} | set(ranking.tangents)
     known = (*tried, *model.labels)
     reasons = {k.removeprefix(PART_OF): v for k, v in scanner.bank.not_testable.items() if k not in known}
+    seen = {name for name, energy in result.energy.items() if _is_sized(name, energy)} - set(sized)
+    reasons |= dict.fromkeys(seen, "too few samples: no size of it would be told")
     return reasons | {
         name: "cannot be told from what the model already has on this campaign"
         for name in tried - skipped(model, scanner.record.signals)

@@ -232,10 +232,11 @@ def judge(
             test = "Repeat the run from power-on, everything held: noise does not come back."
         return Judgement("unknown", tuple(causes), {driver: 1.0}, driver, test, unexplained, tuple(findings))
     more = selection.last.statistic.get(selection.remains or "", -np.inf)
-    # Gross errors are no cause, nor is what encoders of a platform pass for.
-    all_of_them = strongest if scanner.record.domain == "gyro" and selection.remains != "outliers" else np.inf
+    # What encoders of a platform pass for is no cause.
+    all_of_them = strongest if scanner.record.domain == "gyro" else np.inf
     least = min((c.statistic for c in causes if c.effect == selection.remains), default=all_of_them)
-    if causes and more > least:
+    # Nor are gross errors.
+    if causes and selection.remains != "outliers" and more > least:
         # A name holds less of what is there than it leaves, in a form that it cannot have; or all of them do.
         driver, score = selection.last.best(drivers=True)
         driver = driver if score > steps.threshold else None
