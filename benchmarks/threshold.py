@@ -73,7 +73,7 @@ def main(argv: list[str] | None = None) -> None:
     head = ["noise", "median of S", "95 %", "99 %", "largest", f"over {SAFE_THRESHOLD:g}"]
     total = draws * len(NOISES)
     lines = [
-        "S is the largest ln evidence ratio of all candidates, with what a name needs less where the noise "
+        "S is ln of the evidence ratio of the best name or driver, with what a name needs less where the noise "
         "beside it has no random walk, and more for what a walk would take of it. Campaigns of noise alone on the "
         "design of the fiber-optic demo, through the search over the noise cells that carry weight.",
         "",
