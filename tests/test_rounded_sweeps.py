@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 import gyromodel as gm
 from gyromodel.campaign import Campaign
