@@ -73,9 +73,9 @@ def main(argv: list[str] | None = None) -> None:
     head = ["noise", "median of S", "95 %", "99 %", "largest", f"over {SAFE_THRESHOLD:g}"]
     total = draws * len(NOISES)
     lines = [
-        "S is ln of the evidence ratio of the best name or driver, with what a name needs less where the noise "
-        "beside it has no random walk, and more for what a walk would take of it. Campaigns of noise alone on the "
-        "design of the fiber-optic demo, through the search over the noise cells that carry weight.",
+        "S is ln of the evidence ratio of the best name or driver, less what it needs more for what a random walk "
+        "would take of it. Campaigns of noise alone on the design of the fiber-optic demo, through the search over the "
+        "noise cells that carry weight.",
         "",
         *table(head, rows),
         "",

@@ -28,7 +28,7 @@ from gyromodel.diagnosis._epochs import epoch_interval
 from gyromodel.diagnosis._evidence import SAFE_THRESHOLD, SIZES, explained_for, log_evidence_ratio
 from gyromodel.diagnosis._forms import step_at
 from gyromodel.diagnosis._pairs import best_pair
-from gyromodel.diagnosis._ranking import EASE, ease, rank
+from gyromodel.diagnosis._ranking import rank
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._verdict import _as_set, _places
 from gyromodel.effects.drivers import BiasStep
@@ -292,7 +292,16 @@ def test_what_a_walk_imitates_needs_more(turns: float, more: tuple[float, float]
         campaign.with_column("output", output, "deg/h"), gm.model_from_effects(["bias"]), hold_out=False
     )
     assert [c.effect for c in found.causes] == ["bias_temperature"]
-    assert more[0] <= found.threshold - (SAFE_THRESHOLD - EASE) <= more[1]
+    assert more[0] <= found.threshold - SAFE_THRESHOLD <= more[1]
+
+
+@pytest.mark.parametrize("row", [0, ROWS - 1])
+def test_a_gross_error_at_an_end_is_no_step(row: int, seed: int) -> None:
+    """A step with one sample on its far side is that sample's error."""
+    wrong = np.where(np.arange(ROWS) == row, 12.0, 0.0)
+    found = gm.diagnose(static_log(np.random.default_rng(seed), wrong), gm.model_from_effects(["bias"]), hold_out=False)
+    assert found.verdict == "adequate"
+    assert any(f"data row {row + 1}:" in line for line in found.findings)
 
 
 @pytest.mark.long
@@ -477,7 +486,7 @@ def test_a_further_line_is_contested_by_its_other_names(rng: np.random.Generator
 
 # Weak effects beside which one of a thousand lines, or of as many steps, explains as much by chance.
 WEAK = [
-    study.Case(4486955809305969, "static_cycle", "white", "bias_pressure", 1.0),
+    study.Case(4486955809305969, "static_cycle", "white", "bias_pressure", 1.1),
     study.Case(706866630942447, "static_cycle", "random_walk", "bias_supply_voltage", 1.0),
     study.Case(4237361959852665, "turntable", "flicker", "bias_magnetic", 1.0),
 ]
@@ -492,10 +501,33 @@ def test_a_name_is_the_same_only_as_what_holds_its_signal(case: study.Case) -> N
     assert answer.causes == (case.effect,)
 
 
-@pytest.mark.parametrize(("name", "less"), [("bias_temperature", EASE), ("bias_drift", 0.0), ("smooth(time)", 0.0)])
-def test_a_name_needs_less_where_no_random_walk_is_beside_it(name: str, less: float) -> None:
-    assert ease(name, walks=False) == less
-    assert ease(name, walks=True) == 0.0
+# A bias that a random walk from zero does nearly as well, beside another effect; of the last a sine and an even
+# polynomial make up a whole one.
+BESIDE_A_BIAS = [
+    study.Case(1825966395333899, "rate_temperature", "white", "bias+rate_hysteresis", 3.0),
+    study.Case(1981787088328670, "static_cycle", "white", "bias+bias_temperature_rate", 3.0),
+    study.Case(1527133870609146, "rate_temperature", "white", "scale_nonlinearity+bias", 3.0),
+]
+
+
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(BESIDE_A_BIAS[0], marks=pytest.mark.long), *BESIDE_A_BIAS[1:]],
+    ids=lambda case: case.effect,
+)
+def test_a_bias_is_likelier_than_a_walk_from_zero(case: study.Case) -> None:
+    answer = study.run_engine(study.build(case))
+    assert answer.verdict == "named"
+    assert set(answer.causes) == set(case.effect.split("+"))
+
+
+def test_what_a_fit_does_not_hold_is_not_found() -> None:
+    """A saturation of another share than a whole one leads, and its fit gains nothing."""
+    answer = study.run_engine(
+        study.build(study.Case(4432649679292422, "rate_steps", "white", "scale_nonlinearity", 1.0))
+    )
+    assert answer.verdict == "ambiguous"
+    assert answer.causes[0] == "scale_nonlinearity"
 
 
 def test_higher_harmonics_of_a_code_are_no_lines(rng: np.random.Generator, tmp_path) -> None:

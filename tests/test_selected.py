@@ -45,7 +45,7 @@ def test_far_above_what_is_needed_nothing_is_allowed_for() -> None:
     assert after_selection(30.0, LEAST) == pytest.approx((30 - 1.96, 30 + 1.96), abs=1e-3)
 
 
-@pytest.mark.parametrize(("slope", "widened"), [(0.034, True), (0.3, False)])
+@pytest.mark.parametrize(("slope", "widened"), [(0.036, True), (0.3, False)])
 def test_a_weak_cause_has_the_wider_interval(slope: float, widened: bool) -> None:
     above = 15 * np.sin(2 * np.pi * 20.0 * np.arange(ROWS) / 4000.0)
     campaign = static_log(np.random.default_rng(2), slope * above)

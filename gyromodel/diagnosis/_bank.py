@@ -46,8 +46,8 @@ class Block:
     """Columns of one form of one candidate; they stand at `start` … `start + width` of the bank.
 
     Forms of one `structure` differ only in the values of nonlinear parameters. `along` is what a driver's first column
-    is drawn over; `least` the smallest
-    coefficient of a positive effect; `price` what its evidence pays (nats) for being one of many of its kind.
+    is drawn over; `least` the smallest coefficient of a positive effect; `price` what its evidence pays (nats) for
+    being one of many of its kind, or by its prior odds.
     """
 
     name: str
@@ -81,6 +81,10 @@ class Bank:
     def structures(self, name: str) -> int:
         """How many structures a catalogue effect's forms have."""
         return len({b.structure for b in self.blocks if b.name == name and b.effect is not None and not b.effect.grown})
+
+    def price(self, name: str) -> float:
+        """What a candidate's evidence pays beside that for its forms (nats); nothing where it has no columns here."""
+        return next((b.price for b in self.blocks if b.name == name), 0.0)
 
     def layout(self) -> dict[int, tuple[int, int, int]]:
         """By width: the first block of that width, how many there are, and the first one's first column."""
@@ -161,7 +165,7 @@ def build_bank(record: Record) -> Bank:
                 effect,
                 along.get(i),
                 effect.least(signals) if effect is not None else 0.0,
-                float(np.log(len(many))) if i >= priced else 0.0,
+                float(np.log(len(many)) if i >= priced else -np.log(effect.odds if effect is not None else 1.0)),
             )
         )
         start += shape.shape[1]

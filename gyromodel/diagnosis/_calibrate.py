@@ -18,7 +18,7 @@ import numpy as np
 from gyromodel import __version__
 from gyromodel._cache import cache_folder
 from gyromodel.diagnosis._drivers import RESPONSE_DRIVER
-from gyromodel.diagnosis._ranking import EASE, EXEMPT, cells_of_weight, ease, is_driver, rank, skipped, tangents
+from gyromodel.diagnosis._ranking import EXEMPT, cells_of_weight, is_driver, rank, skipped, tangents
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.estimate import Estimate, filter_of
 from gyromodel.numerics.state_space import colour
@@ -34,7 +34,7 @@ SET = ("rate", "temperature", "acceleration", "azimuth", "table", "magnetic", "v
 COURSE, SAME = 32, 0.1
 
 # Counts the rules by which draws have been scored: those kept by an earlier one do not serve.
-RULE = 2
+RULE = 3
 
 _draw = jax.jit(jax.vmap(colour, in_axes=(None, 0)))
 
@@ -44,7 +44,7 @@ def null_scores(
 ) -> np.ndarray:
     """S of each draw of the baseline's own noise, from the cache where this design has been drawn before.
 
-    S is the largest ln B of a name or of a driver, with what that needs less or more for what a random walk makes
+    S is the largest ln B of a name or of a driver, less what that needs more for what a random walk makes
     (`Ranking.significance`).
 
     Args:
@@ -79,16 +79,15 @@ def null_scores(
         batches = scanner.run_many(cells, columns, drawn, {}, tangents=continued)
         logs = np.stack([b.log_likelihood for b in batches]) + prior
         names = sorted(set.intersection(*(set(b.evidence) for b in batches)) - skip)
-        null, each, needed = np.logaddexp.reduce(logs), [], []
+        null, each, more = np.logaddexp.reduce(logs), [], []
         for name in names:
             beside = logs + np.stack([b.evidence[name] for b in batches])
             evidence = np.logaddexp.reduce(beside) - null
-            own = np.where(walks[beside.argmax(axis=0)], 0.0, ease(name, False))
+            among = evidence
             if walks.any() and name not in EXEMPT:
                 among = np.logaddexp.reduce(beside[walks]) - np.logaddexp.reduce(logs[walks])
-                own -= np.maximum(evidence - among, 0.0)
             each.append(evidence)
-            needed.append(own)
+            more.append(np.maximum(evidence - among, 0.0))
         if {"bias_periodic", RESPONSE_DRIVER} <= set(names):
             # Lines that any response to the motion explains better are not what a search would add (`Ranking.best`).
             line = names.index("bias_periodic")
@@ -96,7 +95,7 @@ def null_scores(
         drivers = np.array([is_driver(name) for name in names])
         # Of the best name and of the best driver, as a search weighs no other.
         tops = [np.where(kind[:, None], each, -np.inf).argmax(axis=0) for kind in (drivers, ~drivers) if kind.any()]
-        scores.append(np.max([(np.array(each) + needed)[top, np.arange(together)] for top in tops], axis=0))
+        scores.append(np.max([(np.array(each) - more)[top, np.arange(together)] for top in tops], axis=0))
         say("calibrating the threshold", 0.06 + 0.18 * min(1.0, (start + together) / draws))
     found = np.concatenate(scores)[:draws]
     with suppress(OSError):
@@ -112,7 +111,7 @@ def _design(scanner: Scanner, baseline: Estimate, draws: int, seed: int) -> tupl
     """A digest of what must be the same for draws to serve, and the course of what may differ a little."""
     record, bank = scanner.record, scanner.bank
     searched = [*((b.name, b.structure) for b in bank.blocks if b.kind == "effect"), *bank.scans]
-    same = (__version__, RULE, EASE, EXEMPT, baseline.model.labels, sorted(baseline.model.fixed), scanner.stated, draws,
+    same = (__version__, RULE, EXEMPT, baseline.model.labels, sorted(baseline.model.fixed), scanner.stated, draws,
             seed, searched, scanner.runs)  # fmt: skip
     columns = []
     for name in sorted(n for n in record.signals if n.startswith(SET)):

@@ -67,7 +67,7 @@ def cause_of(
         parameters = tuple(ParameterValue(r.name, r.value, r.std, r.unit) for r in rows)
         if q == 1 and least <= statistic:
             own = float(log_evidence_ratio(np.array(explained), result.rss, nu, 1))
-            price = min(max(own - statistic, 0.0), float(np.log(shapes)))
+            price = float(np.clip(own - statistic, min(scanner.bank.price(name), 0.0), np.log(shapes)))
             part = least_told(statistic, least, price, nu)
             parameters = tuple(_told(p, step.effect, part) for p in parameters)
         if isinstance(step.effect, BiasStep):

@@ -230,7 +230,7 @@ def diagnose(
     before, after = (np.asarray(e.model.predict(record.signals))[: record.rows] for e in (baseline, extended))
     slopes = [np.asarray(e.model.slope(record.signals))[: record.rows] for e in (baseline, extended)]
     output = np.where(record.present, np.asarray(record.signals["output"])[: record.rows], np.nan)
-    sizes = minimum_detectable(session.scanner, selection.last, session.threshold, unit, first=not selection.found)
+    sizes = minimum_detectable(session.scanner, selection.last, session.threshold, unit)
     return Diagnosis(
         verdict=judgement.verdict,
         causes=judgement.causes,
@@ -245,7 +245,7 @@ def diagnose(
         credible_set=judgement.credible_set,
         unexplained=judgement.unexplained,
         findings=(*findings, *judgement.findings),
-        threshold=session.threshold - _eased(rankings[0]),
+        threshold=session.threshold + _more_needed(rankings[0]),
         threshold_kind="calibrated" if calibrate else "safe",
         p_value=_p_value(selection, nulls) if calibrate else None,
         searched=tuple(dict.fromkeys([*bank.names(), *(name for r in rankings for name in r.tangents)])),
@@ -330,10 +330,10 @@ def _like_hops(selection: Selection, free: Estimate) -> bool:
     return in_time and selection.driver in (None, "smooth(time)") and (slow or bool(selection.found))
 
 
-def _eased(first: Ranking) -> float:
-    """Nats that the leading name needed less."""
+def _more_needed(first: Ranking) -> float:
+    """Nats that the leading name needed more."""
     name, _ = first.best(drivers=False)
-    return first.eased(name) - first.more_needed(name) if name else 0.0
+    return first.more_needed(name) if name else 0.0
 
 
 def _p_value(selection: Selection, nulls: np.ndarray) -> float:

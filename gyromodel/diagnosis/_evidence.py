@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import logsumexp
 
 SIZES = np.array([1e1, 1e2, 1e3, 1e4])
 # ln of the evidence ratio that noise alone exceeds less than once in a hundred campaigns; see benchmarks/threshold.py.
@@ -40,7 +39,9 @@ def explained_for(log_ratio: float, nu: int, q: int) -> float:
 
 def log_sum(values: np.ndarray | Sequence[float]) -> float:
     """ln of the sum of exponentials."""
-    return float(np.asarray(logsumexp(values)))
+    each = np.asarray(values, float)
+    top = float(each.max()) if each.size else -np.inf
+    return top + float(np.log(np.exp(each - top).sum())) if np.isfinite(top) else top
 
 
 def log_mean(values: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, permutations
 
 import numpy as np
 
@@ -19,6 +19,8 @@ from gyromodel.model import record_span
 
 # Lines that lead every other name by this much (nats) are not chosen again.
 LINE_LEAD = 20.0
+# The lead (nats) that a further cause must have over more of one found before: with less, neither is likely enough.
+DOUBT = 3.0
 # The lead (nats) over a random walk at which what it imitates is put beside it: the walk alone is one in twenty.
 SLOW_LEAD = float(np.log(19.0))
 
@@ -31,6 +33,9 @@ def exchanged(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[lis
     """
     while True:
         found, estimate, rankings = _chosen_again(steps, found, estimate)
+        if fewer := _one_for_two(steps, found):
+            found, estimate = fewer
+            continue
         own = {i: r.statistic[found[i].name] for i, r in rankings.items() if found[i].name in r.statistic}
         needless = [i for i, v in own.items() if v < _least(steps, rankings[i], found[i].name)]
         if not needless or len(found) < 2:
@@ -41,6 +46,25 @@ def exchanged(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[lis
         if after is None:
             return found, estimate, rankings
         found, estimate = fewer, after
+
+
+def _one_for_two(steps: Steps, found: list[Found]) -> tuple[list[Found], Estimate] | None:
+    """What was found less an addition that another one, which it led by little, makes needless in a form of its own."""
+    for i, j in permutations(range(len(found)), 2):
+        step, other = found[i], found[j]
+        led_by = step.ranking.statistic.get(step.name, np.inf) - step.ranking.statistic.get(other.name, -np.inf)
+        forms = steps.scanner.bank.forms(other.name)
+        if step.effect is None or step.name == other.name or len(forms) < 2 or led_by > DOUBT:
+            continue
+        others = [f for k, f in enumerate(found) if k not in (i, j)]
+        base = steps.fit(others)
+        if base is None or other.name not in (ranking := steps.rank(base, others)).statistic:
+            continue
+        fewer = [*others, steps.step(others, base, ranking, other.name)]
+        after = steps.fit(fewer)
+        if after is not None and steps.fits_better(fewer, found, -DOUBT):
+            return fewer, after
+    return None
 
 
 def _least(steps: Steps, ranking: Ranking, name: str) -> float:

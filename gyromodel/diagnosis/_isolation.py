@@ -15,7 +15,7 @@ from gyromodel.diagnosis._added_tests import added_tests
 from gyromodel.diagnosis._bank import PART_OF, build_bank
 from gyromodel.diagnosis._evidence import SAFE_THRESHOLD, explained_for
 from gyromodel.diagnosis._forms import step_at
-from gyromodel.diagnosis._ranking import ease, skipped
+from gyromodel.diagnosis._ranking import skipped
 from gyromodel.diagnosis._scan import epochs_of
 from gyromodel.effects import CATALOGUE, Effect, Signals
 from gyromodel.effects._base import evaluate
@@ -305,8 +305,8 @@ def _sizes(
 
     detectable = {}
     for name, columns in left.items():
-        least = threshold - ease(name, float(ratios.walk) > 0) + np.log(len(columns))
-        needed = explained_for(least, nu, columns[0].shape[1])
+        price = np.log(len(columns)) + bank.price(name)
+        needed = explained_for(threshold + price, nu, columns[0].shape[1])
         detectable[name] = size(name, float(np.sqrt(needed)) + POWER)
     apart = {}
     for a, b in itertools.permutations(left, 2):

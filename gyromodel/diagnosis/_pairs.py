@@ -39,14 +39,15 @@ def best_pair(scanner: Scanner, ranking: Ranking) -> tuple[tuple[str, str] | Non
     data = np.column_stack([base, columns.reshape(len(columns), -1), ranking.residual])
     data = np.where(scanner.present[:, None], data, 0.0)
     pairs = np.array(list(combinations(range(len(names)), 2)))
-    price = np.log((len(names) - 1) / 2) + np.log([forms[name] for name in names])[pairs].sum(axis=1)
+    each = np.array([np.log(forms[name]) + bank.price(name) for name in names])
+    price = np.log((len(names) - 1) / 2) + each[pairs].sum(axis=1)
     nu = scanner.degrees_of_freedom - p
-    each = []
+    by_cell = []
     for g, result in ranking.results.items():
         t, q = _explained(scanner.cells.whiten(g, data), p, pairs)
-        each.append(result.log_likelihood + ranking.log_prior[g] + log_evidence_ratio(t, result.rss, nu, q))
+        by_cell.append(result.log_likelihood + ranking.log_prior[g] + log_evidence_ratio(t, result.rss, nu, q))
     null = log_sum([r.log_likelihood + ranking.log_prior[g] for g, r in ranking.results.items()])
-    together = np.array([log_sum(of_pair) for of_pair in np.array(each).T]) - null - price
+    together = np.array([log_sum(of_pair) for of_pair in np.array(by_cell).T]) - null - price
     top = int(np.argmax(together))
     first, second = pairs[top]
     return (names[first], names[second]), float(together[top])

@@ -31,11 +31,8 @@ NEARBY, HOPELESS = 7.0, 30.0
 MARKOV_PRIOR, MARKOV_NAMED = np.log(0.2), np.log(0.05)
 # Functions of time that one run cannot tell from a random walk.
 SLOW_IN_TIME = ("bias_drift", "bias_warmup", "bias_step")
-# Nats that the first name needs less where the noise beside it has no random walk: most of what noise imitates, a walk
-# does.
-EASE = 1.0
-# What has its own rule for a random walk, or nothing to do with one.
-EXEMPT = (*SLOW_IN_TIME, "outliers")
+# What has its own rule for a random walk, or nothing to do with one; a bias is where a walk begins.
+EXEMPT = (*SLOW_IN_TIME, "bias", "outliers")
 
 
 @dataclass(frozen=True)
@@ -73,13 +70,9 @@ class Ranking:
 
     @property
     def significance(self) -> float:
-        """S of what a search would add, or of the best driver, with what that needs less or more."""
+        """S of what a search would add, or of the best driver, less what that needs more."""
         tops = [top for drivers in (False, True) if (top := self.best(drivers=drivers)[0])]
-        return max((self.statistic[k] + self.eased(k) - self.more_needed(k) for k in tops), default=-np.inf)
-
-    def eased(self, name: str) -> float:
-        """Nats that a candidate needs less as the first, by the noise beside it."""
-        return ease(name, self.walks[self.best_cell(name)])
+        return max((self.statistic[k] - self.more_needed(k) for k in tops), default=-np.inf)
 
     def more_needed(self, name: str) -> float:
         """Nats that a candidate needs more: what it would lose were it known that the noise has a random walk.
@@ -129,11 +122,6 @@ class Ranking:
         """Part of the residual sum of squares that a candidate's best form explains, where it is best."""
         result = self.results[self.best_cell(name)]
         return result.best[name][1] / result.rss
-
-
-def ease(name: str, walks: bool) -> float:
-    """Nats that a candidate needs less, by whether the noise beside it has a random walk."""
-    return 0.0 if walks or is_driver(name) or is_noise(name) or name in EXEMPT else EASE
 
 
 def evidence_in(results: dict[int, CellResult], cells: Iterable[int], log_prior: np.ndarray, name: str) -> float:

@@ -428,9 +428,9 @@ class Scanner:
 
 
 def epochs_of(record: Record) -> tuple[np.ndarray, np.ndarray]:
-    """Samples that a step may come before, in each run all but the first and the last; and where their runs end."""
+    """Samples that a step may come before, with two of their run or more on either side; and where their runs end."""
     run, rows = record.run, np.flatnonzero(record.present)
-    parts = [part[1:-1] for part in np.split(rows, np.flatnonzero(np.diff(run[rows])) + 1)]
+    parts = [part[2:-1] for part in np.split(rows, np.flatnonzero(np.diff(run[rows])) + 1)]
     epochs = np.concatenate(parts)
     return epochs, np.searchsorted(run, run[epochs], side="right")
 

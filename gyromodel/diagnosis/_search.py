@@ -11,7 +11,7 @@ from gyromodel.declarations import measured
 from gyromodel.diagnosis._apart import like
 from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._evidence import log_evidence_ratio, log_sum
-from gyromodel.diagnosis._exchange import SLOW_LEAD, exchanged, steady, unresolved
+from gyromodel.diagnosis._exchange import DOUBT, SLOW_LEAD, exchanged, steady, unresolved
 from gyromodel.diagnosis._forms import MAXIMUM_LINES
 from gyromodel.diagnosis._lines import lines_of
 from gyromodel.diagnosis._pairs import best_pair
@@ -26,8 +26,6 @@ MAXIMUM_ROUNDS = 12
 MAXIMUM_STEPS = 3
 # A function of time alone must beat a random walk by this much in one run: no real slow noise is exactly a random walk.
 TIME_MARGIN = 15.0
-# The lead (nats) that a further cause must have over more of one found before: with less, neither is likely enough.
-DOUBT = 3.0
 # Nats by which a cause that no catalogue lists must do better: it is rarer than one that does.
 UNLISTED = 1.0
 
@@ -63,6 +61,7 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
     """
     scanner, threshold = steps.scanner, steps.threshold
     path: list[Found] = []
+    lost: set[str] = set()
     estimates, remains, small = [steps.baseline], "", ""
     while True:
         estimate = estimates[-1]
@@ -70,11 +69,12 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
         full = len(lines_of(estimate.model)) >= MAXIMUM_LINES * scanner.runs
         lines = ranking.statistic.get("bias_periodic", -np.inf)
         remains = "bias_periodic" if full and lines >= threshold else ""
-        name, score = ranking.best(drivers=False, but=("bias_periodic" if full else "", "" if path else avoid))
-        for more in (f.name for f in path if f.grows):
+        barred = ("bias_periodic" if full else "", "" if path else avoid, *lost)
+        name, score = ranking.best(drivers=False, but=barred)
+        for more in (f.name for f in path if f.grows and f.name not in lost):
             if ranking.statistic.get(more, -np.inf) > score - DOUBT:
                 name, score = more, ranking.statistic[more]
-        if name is None or not _significant(steps, ranking, name, score, first=not path):
+        if name is None or not _significant(steps, ranking, name, score):
             both = _together(steps, path, estimate, ranking)
             if not both or len(path) + 2 > MAXIMUM_ROUNDS or any(unresolved(e, f, scanner.step) for f, e in both):
                 break
@@ -92,6 +92,9 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
         if after is None or small:
             remains = name
             break
+        if not steps.keeps(estimate, step, after):
+            lost.add(name)
+            continue
         if progress:
             progress(f"found {name}", min(0.25 + 0.06 * len(path), 0.6))
         path.append(step)
@@ -217,17 +220,10 @@ def _before(i: int, path: list[Found], estimates: list[Estimate]) -> Selection:
     )
 
 
-def _significant(steps: Steps, ranking: Ranking, name: str, score: float, *, first: bool) -> bool:
-    """Whether a name is to be added; what would be the first needs less where no walk is beside it."""
-    least = steps.least(ranking, name)
-    if score >= least:
-        return True
-    eased = least - ranking.eased(name)
-    if score < min(eased, SLOW_LEAD):
-        return False
-    if like(steps.scanner, ranking, name, SLOW_IN_TIME) and _slow_structure(steps, ranking, name, score):
-        return True
-    return first and score >= eased
+def _significant(steps: Steps, ranking: Ranking, name: str, score: float) -> bool:
+    """Whether a name is to be added."""
+    slow = _slow_structure(steps, ranking, name, score) and like(steps.scanner, ranking, name, SLOW_IN_TIME)
+    return slow or bool(score >= steps.least(ranking, name))
 
 
 def _slow_structure(steps: Steps, ranking: Ranking, name: str, score: float) -> bool:

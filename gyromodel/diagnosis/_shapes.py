@@ -11,7 +11,7 @@ from gyromodel.diagnosis._bank import PART_OF
 from gyromodel.diagnosis._drivers import driver_unit, smooth_columns
 from gyromodel.diagnosis._evidence import log_evidence_ratio, log_sum
 from gyromodel.diagnosis._forms import form_effect
-from gyromodel.diagnosis._ranking import Ranking, ease, is_driver, is_noise, skipped
+from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise, skipped
 from gyromodel.diagnosis._result import Driver
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import Selection
@@ -98,12 +98,10 @@ def _nearest(ranking: Ranking, driver: str, explained: float) -> tuple[str, floa
     return name, float(min(share, 1.0)), float(behind)
 
 
-def minimum_detectable(
-    scanner: Scanner, ranking: Ranking, threshold: float, unit: str, *, first: bool
-) -> dict[str, tuple[float, str]]:
+def minimum_detectable(scanner: Scanner, ranking: Ranking, threshold: float, unit: str) -> dict[str, tuple[float, str]]:
     """Size of each searched effect that would have been found with 80 % probability, at the noise of the final fit.
 
-    Those are left out that too few samples show at no size; `first` where nothing was found.
+    Those are left out that too few samples show at no size.
     """
     sizes: dict[str, tuple[float, str]] = {}
     widths = {b.name: b for b in reversed(scanner.bank.blocks)}
@@ -114,7 +112,8 @@ def minimum_detectable(
         # What continues an effect begins with the column that counts.
         order = np.argsort(np.where(energy > 0, energy, np.inf))
         form = 0 if name in ranking.tangents else int(order[(energy > 0).sum() // 2])
-        size = _detectable(ranking, name, form, threshold + np.log(np.sum(energy > 0)), q, first=first)
+        price = np.log(np.sum(energy > 0)) + scanner.bank.price(name)
+        size = _detectable(ranking, name, form, threshold + price, q)
         if size is None:
             continue
         if name in ranking.tangents:
@@ -131,7 +130,7 @@ def _is_sized(name: str, energy: np.ndarray) -> bool:
     return not is_driver(name) and name != "outliers" and bool((energy > 0).any())
 
 
-def _detectable(ranking: Ranking, name: str, form: int, least: float, q: int, *, first: bool) -> float | None:
+def _detectable(ranking: Ranking, name: str, form: int, least: float, q: int) -> float | None:
     """Size of one form at which its evidence reaches what is needed in 80 % of campaigns; None where none does.
 
     Of data that hold it, any noise cell leaves more unexplained: noise that imitates it gains on the others.
@@ -142,7 +141,6 @@ def _detectable(ranking: Ranking, name: str, form: int, least: float, q: int, *,
         form: number of its form.
         least: ln B of the form that is needed, beside noise with a random walk.
         q: its columns.
-        first: whether it would be the first name, which needs less beside noise without a walk.
     """
     # A cell that sees nothing of the form cannot tell it from nothing, however large.
     cells = [g for g in ranking.results if ranking.results[g].energy[name][form] > 0]
@@ -157,8 +155,7 @@ def _detectable(ranking: Ranking, name: str, form: int, least: float, q: int, *,
         alone = logs - 0.5 * nu * np.log1p(explained / rss)
         beside = alone + log_evidence_ratio(explained, rss + explained, nu, q)
         ratio = min(log_sum(beside[c]) - log_sum(alone[c]) for c in (np.ones_like(walks), *among))
-        best = int(beside.argmax())
-        return ratio + (ease(name, bool(walks[best])) if first else 0.0) - least, best
+        return ratio - least, int(beside.argmax())
 
     deviation = np.sqrt(rss / nu / energy)
     low, high = 0.0, float(deviation.min())

@@ -21,6 +21,8 @@ NoisePath = Sequence[NoiseRatios]
 BETWEEN = 0.05
 # Times that the uncertainty of a shape may grow by that of all others.
 ENTANGLED = 300.0
+# Part of its evidence (nats) by which a fit must gain with a candidate: what was searched may be no form it can have.
+KEPT = 0.5
 # By how many nats a candidate must beat another to take its place.
 EXCHANGE = 2.0
 
@@ -121,7 +123,8 @@ class Steps:
         # Fits compare on the same data.
         given_up = Found("", None, rows_of(each), ranking)
         fits = {step.name: self.fit(standing([*found, step, given_up])) for step in each}
-        price = {k: np.log(max(self.scanner.bank.structures(k), 1)) for k in fits}
+        bank = self.scanner.bank
+        price = {k: np.log(max(bank.structures(k), 1)) + bank.price(k) for k in fits}
         quality = {k: _quality(fit) - price[k] for k, fit in fits.items() if fit is not None}
         before = self.fit([*found, given_up])
         if name not in quality or before is None:
@@ -132,11 +135,11 @@ class Steps:
         told = {k: own + v - quality[name] for k, v in quality.items()}
         return replace(ranking, statistic=ranking.statistic | told, fitted=frozenset(told))
 
-    def fits_better(self, found: Sequence[Found], other: Sequence[Found]) -> bool:
-        """Whether some steps fit better than others, on the data that both keep."""
+    def fits_better(self, found: Sequence[Found], other: Sequence[Found], by: float = 0.0) -> bool:
+        """Whether some steps fit better than others, by some nats, on the data that both keep."""
         given_up = Found("", None, rows_of([*found, *other]), found[0].ranking)
         one, two = (self.fit([*steps, given_up]) for steps in (found, other))
-        return one is not None and (two is None or bool(_quality(one) > _quality(two)))
+        return one is not None and (two is None or bool(_quality(one) > _quality(two) + by))
 
     def _has_shape(self, name: str) -> bool:
         """Whether a candidate's shape goes on between the forms searched; a fit of a platform takes too long for it."""
@@ -180,6 +183,19 @@ class Steps:
         step = replace(step, rows=rows)
         return step, self.fit(standing([*found, step]))
 
+    def keeps(self, estimate: Estimate, step: Found, after: Estimate) -> bool:
+        """Whether a fit with one more step gains in its noise what the search saw in the step.
+
+        A shape is fitted with what physics holds of it, which the search did not; with rows given up it is unknown.
+        """
+        if step.effect is None or step.rows or all(p.linear for p in step.effect.declared().values()):
+            return True
+        try:
+            before = fit_record(estimate.record, estimate.model_as_given(), ratios=after.ratios)
+        except EstimateError:
+            return True
+        return bool(_profiled(after) - _profiled(before) >= KEPT * step.ranking.statistic[step.name])
+
     def all_but(self, found: Sequence[Found], i: int) -> tuple[Estimate, Ranking] | None:
         """The fit with everything found except item i, and all candidates beside it; none where that fit fails."""
         others = [*found[:i], *found[i + 1 :]]
@@ -198,12 +214,16 @@ def standing(path: Sequence[Found]) -> list[Found]:
     return kept[::-1]
 
 
+def _profiled(estimate: Estimate) -> float:
+    """ln likelihood of a fit at its parameters: from the restricted one to −½ ln |V| − ½ n ln RSS."""
+    volume = np.linalg.slogdet(estimate.covariance)[1] + len(estimate.covariance) * np.log(estimate.degrees_of_freedom)
+    return estimate.log_likelihood - 0.5 * float(volume)
+
+
 def _quality(estimate: Estimate) -> float:
     """ln likelihood of a fit, less what its parameters cost (Schwarz): by it fits of different parameters compare."""
     p, nu = len(estimate.covariance), estimate.degrees_of_freedom
-    # From the restricted likelihood to the profiled one, −½ ln |V| − ½ n ln RSS; and its price.
-    volume = np.linalg.slogdet(estimate.covariance)[1] + p * np.log(nu)
-    return estimate.log_likelihood - 0.5 * (volume + p * np.log(nu + p))
+    return _profiled(estimate) - 0.5 * p * float(np.log(nu + p))
 
 
 def rows_of(found: Sequence[Found]) -> tuple[int, ...]:

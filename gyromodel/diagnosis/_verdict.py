@@ -197,7 +197,7 @@ def judge(
         close = _close_rival(step, members)
         findings += [close] if close else []
         turn = sum(f.name == name for f in found[i:])
-        least = steps.least(ranking, name) - (0.0 if i else ranking.eased(name))
+        least = steps.least(ranking, name)
         causes.append(cause_of(scanner, extended, step, turn, ranking, members, statistic, trials, null_scores, least))
         sets.append(members)
     # Of these only something in common has a size: which of them it is, this campaign cannot tell.

@@ -22,6 +22,8 @@ Domain = Literal["gyro", "platform"]
 SECOND_THERMOMETER, ANY_ACCELERATION = "temperature_<place>", "acceleration_<axis>"
 # … and the angles of a vibration test, which effects of a platform see in parts of their own.
 TABLE_ANGLES, GIMBAL_ANGLES = "table_<axis>", "gimbal_<axis>"
+# Prior odds on what every gyro has, against what some have.
+EVERY_GYRO = 10.0
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ class Effect(eqx.Module):
     coefficients `part` are shares, from none to all; `scan` names a fast search over
     every epoch or frequency; `untested` says why a campaign leaves it no `candidates`; `remembers` that a sample's
     contribution depends on its neighbours in time; `reach` is the largest amplitude (internal units) of an effect that
-    continues others.
+    continues others; `odds` are the prior odds on it against any other effect.
     """
 
     id: ClassVar[str]
@@ -90,6 +92,7 @@ class Effect(eqx.Module):
     untested: ClassVar[str] = "its driver does not vary"
     remembers: ClassVar[bool] = False
     reach: ClassVar[float] = np.inf
+    odds: ClassVar[float] = 1.0
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from gyromodel.effects._base import CATALOGUE, Effect, Signals, parameter, setting, stack
+from gyromodel.effects._base import CATALOGUE, EVERY_GYRO, Effect, Signals, parameter, setting, stack
 
 
 class Bias(Effect):
@@ -19,6 +19,7 @@ class Bias(Effect):
     site = "rate"
     needs = ()
     cause = "The gyro reads a rate at rest."
+    odds = EVERY_GYRO
     test = "Any covariate that stays constant looks the same: vary it."
 
     value: Float[Array, ""] = parameter("deg/h", 1.0, "output at rest, as a rate")

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from gyromodel.effects._base import Effect, Signals, parameter, setting, stack
+from gyromodel.effects._base import EVERY_GYRO, Effect, Signals, parameter, setting, stack
 from gyromodel.effects._shapes import EARTHLY, OverTemperature, beyond_earth, check_curve, curve_columns, curve_forms
 
 
@@ -25,6 +25,7 @@ class ScaleFactor(Effect):
     site = "gain"
     needs = ("rate",)
     cause = "The optical or mechanical gain differs from the nominal one."
+    odds = EVERY_GYRO
     test = "Calibrate the rate table against a second reference: its rate error looks the same."
 
     value: Float[Array, ""] = parameter("1", 1.0, "output per unit of input rate", default=jnp.nan)
