@@ -191,7 +191,9 @@ class Steps:
         if step.effect is None or step.rows or all(p.linear for p in step.effect.declared().values()):
             return True
         try:
-            before = fit_record(estimate.record, estimate.model_as_given(), ratios=after.ratios)
+            before = fit_record(
+                estimate.record, estimate.model_as_given(), ratios=after.ratios, solver="levenberg_marquardt"
+            )
         except EstimateError:
             return True
         return bool(_profiled(after) - _profiled(before) >= KEPT * step.ranking.statistic[step.name])
