@@ -121,6 +121,9 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
             ranking = steps.rank(estimates[-1], found)
             name, score = ranking.best(drivers=False, but=("bias_periodic",))
             remains = remains or (name if name and score >= steps.least(ranking, name) else "")
+    # What no fit holds is there all the same, unless something else took its place.
+    there = (name for name in sorted(lost) if ranking.statistic.get(name, -np.inf) >= steps.least(ranking, name))
+    remains = remains or next(there, "")
     driver = significant_driver(ranking, threshold, scanner.runs)
     selection = Selection(
         estimates[-1], tuple(found), tuple(path), ranking, tuple(estimates), driver, left_out, remains, small
