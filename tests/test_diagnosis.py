@@ -505,20 +505,52 @@ def test_a_name_is_the_same_only_as_what_holds_its_signal(case: study.Case) -> N
 # polynomial make up a whole one.
 BESIDE_A_BIAS = [
     study.Case(1825966395333899, "rate_temperature", "white", "bias+rate_hysteresis", 3.0),
-    study.Case(1981787088328670, "static_cycle", "white", "bias+bias_temperature_rate", 3.0),
     study.Case(1527133870609146, "rate_temperature", "white", "scale_nonlinearity+bias", 3.0),
 ]
 
 
 @pytest.mark.parametrize(
     "case",
-    [pytest.param(BESIDE_A_BIAS[0], marks=pytest.mark.long), *BESIDE_A_BIAS[1:]],
+    BESIDE_A_BIAS,
     ids=lambda case: case.effect,
 )
 def test_a_bias_is_likelier_than_a_walk_from_zero(case: study.Case) -> None:
     answer = study.run_engine(study.build(case))
     assert answer.verdict == "named"
     assert set(answer.causes) == set(case.effect.split("+"))
+
+
+def test_two_names_stay_where_neither_holds_the_other() -> None:
+    """A bias of 16 and a temperature-rate bias of 5 standard deviations, which share nothing."""
+    rows, rng = 2000, np.random.default_rng(1)
+    time = np.arange(rows) * 1.0
+    phase = 2 * np.pi * time / rows
+    temperature = 25 + 10 * np.sin(4 * phase) + 6 * np.sin(7 * phase + 1) + 4 * np.sin(11 * phase + 2)
+    rate = np.gradient(temperature) - np.gradient(temperature).mean()
+    output = rng.standard_normal(rows)
+    hidden = np.column_stack([np.ones(rows), rate, temperature - temperature.mean()])
+    hidden /= np.linalg.norm(hidden, axis=0)
+    output -= hidden @ np.linalg.lstsq(hidden, output, rcond=None)[0]
+    output += hidden[:, :2] @ [16.0, 5.0]
+    columns = {"time": time, "temperature": temperature, "output": output}
+    log = gm.Campaign(columns, {"time": "s", "temperature": "degC", "output": "deg/h"}, {"kind": "rate"})
+    found = gm.diagnose(log, gm.model_from_effects(["bias_temperature"]), hold_out=False)
+    assert {"bias", "bias_temperature_rate"} <= set(found.extended.model.labels)
+    assert not any("ruled bias_temperature_rate out" in line for line in found.findings)
+    assert any("2.3 nats are prior odds" in line for line in found.findings)
+
+
+@pytest.mark.parametrize("campaigns", [1, 12])
+def test_runs_of_three_rows_say_that_a_step_is_not_testable(campaigns: int) -> None:
+    rng, units = np.random.default_rng(3), {"time": "s", "output": "deg/h"}
+    each = [
+        gm.Campaign({"time": np.arange(3.0), "output": 5 + rng.standard_normal(3)}, units, {"kind": "rate"})
+        for _ in range(campaigns)
+    ]
+    found = gm.diagnose(each, gm.model_from_effects(["bias"]), hold_out=False)
+    assert "too few samples" in found.not_testable["bias_step"]
+    stated = gm.GyroModel(gm.model_from_effects(["bias"]).effects, {"noise_white": 1e-6})
+    assert "bias_step" in gm.isolability(each[0], stated, tests=False).not_testable
 
 
 def test_what_a_fit_does_not_hold_is_not_found() -> None:

@@ -52,7 +52,7 @@ def cause_of(
     shapes = comb(len(scanner.points), int(q)) if step.points else len(result.energy.get(name, ())) or 1
     adjusted = float(min(1.0, p * shapes * trials))
     if len(null_scores):
-        adjusted = float((1 + np.sum(null_scores >= statistic)) / (1 + len(null_scores)))
+        adjusted = float((1 + np.sum(null_scores >= statistic - ranking.more_needed(name))) / (1 + len(null_scores)))
     rivals = sorted((k for k in ranking.statistic if k != name), key=lambda k: -ranking.statistic[k])[:4]
     confusers = tuple(Confuser(k, s) for k in rivals if (s := separation(scanner, ranking, name, k)) is not None)
     if step.points:

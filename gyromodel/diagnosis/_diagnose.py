@@ -245,7 +245,7 @@ def diagnose(
         credible_set=judgement.credible_set,
         unexplained=judgement.unexplained,
         findings=(*findings, *judgement.findings),
-        threshold=session.threshold + _more_needed(rankings[0]),
+        threshold=session.threshold + _more_needed(rankings[0], selection.path),
         threshold_kind="calibrated" if calibrate else "safe",
         p_value=_p_value(selection, nulls) if calibrate else None,
         searched=tuple(dict.fromkeys([*bank.names(), *(name for r in rankings for name in r.tangents)])),
@@ -330,9 +330,9 @@ def _like_hops(selection: Selection, free: Estimate) -> bool:
     return in_time and selection.driver in (None, "smooth(time)") and (slow or bool(selection.found))
 
 
-def _more_needed(first: Ranking) -> float:
-    """Nats that the leading name needed more."""
-    name, _ = first.best(drivers=False)
+def _more_needed(first: Ranking, path: Sequence[Found]) -> float:
+    """Nats that the first name, or the leading one where none was added, needed more."""
+    name = path[0].name if path else first.best(drivers=False)[0]
     return first.more_needed(name) if name else 0.0
 
 

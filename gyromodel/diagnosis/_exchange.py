@@ -33,7 +33,7 @@ def exchanged(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[lis
     """
     while True:
         found, estimate, rankings = _chosen_again(steps, found, estimate)
-        if fewer := _one_for_two(steps, found):
+        if fewer := _one_for_two(steps, found, rankings):
             found, estimate = fewer
             continue
         own = {i: r.statistic[found[i].name] for i, r in rankings.items() if found[i].name in r.statistic}
@@ -48,22 +48,28 @@ def exchanged(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[lis
         found, estimate = fewer, after
 
 
-def _one_for_two(steps: Steps, found: list[Found]) -> tuple[list[Found], Estimate] | None:
-    """What was found less an addition that another one, which it led by little, makes needless in a form of its own."""
+def _one_for_two(steps: Steps, found: list[Found], rankings: dict[int, Ranking]) -> tuple[list[Found], Estimate] | None:
+    """What was found less an addition that another one, which it led by little, makes needless in a wider form.
+
+    `rankings` are those beside all but one. Two names have to do better than the one by the odds of a firm name.
+    """
     for i, j in permutations(range(len(found)), 2):
         step, other = found[i], found[j]
         led_by = step.ranking.statistic.get(step.name, np.inf) - step.ranking.statistic.get(other.name, -np.inf)
-        forms = steps.scanner.bank.forms(other.name)
-        if step.effect is None or step.name == other.name or len(forms) < 2 or led_by > DOUBT:
+        if step.effect is None or other.effect is None or step.name == other.name or led_by > DOUBT:
             continue
         others = [f for k, f in enumerate(found) if k not in (i, j)]
         base = steps.fit(others)
-        if base is None or other.name not in (ranking := steps.rank(base, others)).statistic:
+        if base is None or j not in rankings:
             continue
-        fewer = [*others, steps.step(others, base, ranking, other.name)]
-        after = steps.fit(fewer)
-        if after is not None and steps.fits_better(fewer, found, -DOUBT):
-            return fewer, after
+        ranking = steps.rank(base, others)
+        first, alone = (ranking.statistic.get(f.name, -np.inf) for f in (step, other))
+        both = first + rankings[j].statistic.get(other.name, -np.inf)
+        if alone < max(both - DOUBT, steps.least(ranking, other.name)):
+            continue
+        one, after = steps.add(others, steps.step(others, base, ranking, other.name))
+        if after is not None and not unresolved(after, one, steps.scanner.step):
+            return [*others, one], after
     return None
 
 
@@ -101,7 +107,7 @@ def _chosen_again(
         if len(standing(changed)) < len(changed):
             continue
         after = steps.fit(changed)
-        if after is None or not steps.fits_better(changed, found):
+        if after is None or not steps.keeps(base, step, after) or not steps.fits_better(changed, found):
             continue
         if not unresolved(after, step, steps.scanner.step):
             found, estimate, rankings = changed, after, {i: ranking}

@@ -277,13 +277,14 @@ def _sizes(
     for block in bank.blocks:
         if block.effect is not None and block.name not in have:
             forms.setdefault(block.name, []).append(block.effect)
-    if "bias_step" in bank.scans:
-        epochs, _ = epochs_of(record)
+    if "bias_step" in bank.scans and len(epochs := epochs_of(record)[0]):
         chosen = epochs[np.linspace(0, len(epochs) - 1, STEPS + 2).astype(int)[1:-1]]
         forms["bias_step"] = [step_at(record, int(row)) for row in chosen]
     left = {name: view.columns_of(effects) for name, effects in forms.items()}
     whole = {name: view.columns_of(effects, whole=True) for name, effects in forms.items()}
     not_testable = {name.removeprefix(PART_OF): reason for name, reason in bank.not_testable.items()}
+    if "bias_step" in bank.scans and "bias_step" not in forms:
+        not_testable["bias_step"] = "too few samples: no size of it would be told"
     untested = [n for n, reason in not_testable.items() if n in CATALOGUE and reason == CATALOGUE[n].untested]
     for name in [n for n in untested if CATALOGUE[n].continuing(model.effects, record.signals) is not None]:
         not_testable[name] = "continues an effect of the model, at sizes that only data show: it is not sized before"

@@ -127,8 +127,8 @@ class LineGrid:
         return np.stack([np.stack([cc, cs], axis=-1), np.stack([cs, ss], axis=-1)], axis=-2)
 
 
-def line_grid(record: Record) -> LineGrid:
-    """A quarter of the record's resolution, up to half the sample rate."""
+def line_grid(record: Record) -> LineGrid | None:
+    """A quarter of the record's resolution, up to half the sample rate; None where that leaves no frequency."""
     time = np.asarray(record.signals["time"])
     span = record_span(record)
     grid = record.interval
@@ -140,6 +140,8 @@ def line_grid(record: Record) -> LineGrid:
     first = int(np.ceil(FEWEST_CYCLES / span * length * grid))
     frequencies = np.arange(first, length // 2 + 1) / (length * grid)
     frequencies = frequencies[frequencies < 0.5 / record.interval * (1 - 0.5 / record.rows)]
+    if not len(frequencies):
+        return None
     exact = np.arange(min(LOWEST_LINES, len(frequencies)))
     spaced = np.geomspace(len(exact) + 1, len(frequencies), SPACED_LINES).round().astype(int) - 1
     exact = np.unique(np.concatenate([exact, np.clip(spaced, 0, len(frequencies) - 1)]))

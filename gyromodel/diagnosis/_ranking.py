@@ -31,8 +31,8 @@ NEARBY, HOPELESS = 7.0, 30.0
 MARKOV_PRIOR, MARKOV_NAMED = np.log(0.2), np.log(0.05)
 # Functions of time that one run cannot tell from a random walk.
 SLOW_IN_TIME = ("bias_drift", "bias_warmup", "bias_step")
-# What has its own rule for a random walk, or nothing to do with one; a bias is where a walk begins.
-EXEMPT = (*SLOW_IN_TIME, "bias", "outliers")
+# What has its own rule for a random walk, or nothing to do with one.
+EXEMPT = (*SLOW_IN_TIME, "outliers")
 
 
 @dataclass(frozen=True)

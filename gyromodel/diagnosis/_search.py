@@ -99,6 +99,7 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
             progress(f"found {name}", min(0.25 + 0.06 * len(path), 0.6))
         path.append(step)
         estimates.append(after)
+        lost.clear()
         if step.points and scanner.by_points:
             # Which points are right must be settled before anything is read into the rest.
             ranking = steps.rank(after, [step])
@@ -122,8 +123,9 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
             name, score = ranking.best(drivers=False, but=("bias_periodic",))
             remains = remains or (name if name and score >= steps.least(ranking, name) else "")
     # What no fit holds is there all the same, unless something else took its place.
-    there = (name for name in sorted(lost) if ranking.statistic.get(name, -np.inf) >= steps.least(ranking, name))
-    remains = remains or next(there, "")
+    there = {name: ranking.statistic[name] for name in lost if name in ranking.statistic}
+    there = {name: score for name, score in there.items() if _significant(steps, ranking, name, score)}
+    remains = remains or max(there, key=lambda name: there[name], default="")
     driver = significant_driver(ranking, threshold, scanner.runs)
     selection = Selection(
         estimates[-1], tuple(found), tuple(path), ranking, tuple(estimates), driver, left_out, remains, small

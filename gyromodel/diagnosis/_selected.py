@@ -35,7 +35,7 @@ def least_told(statistic: float, threshold: float, price: float, nu: int) -> flo
     Args:
         statistic: of the column, over its shapes and the noise.
         threshold: least that is told.
-        price: what of it the search over shapes has cost (nats).
+        price: what of it the search over shapes has cost (nats), less what prior odds have added.
         nu: degrees of freedom.
     """
     needed, reached = (explained_for(max(s + price, 0.0), nu, 1) for s in (threshold, statistic))

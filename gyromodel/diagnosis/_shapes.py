@@ -188,6 +188,7 @@ def not_testable(scanner: Scanner, ranking: Ranking, model: GyroModel, sized: It
     known = (*tried, *model.labels)
     reasons = {k.removeprefix(PART_OF): v for k, v in scanner.bank.not_testable.items() if k not in known}
     seen = {name for name, energy in result.energy.items() if _is_sized(name, energy)} - set(sized)
+    seen |= {name for name in scanner.bank.scans if name not in result.energy}
     reasons |= dict.fromkeys(seen, "too few samples: no size of it would be told")
     return reasons | {
         name: "cannot be told from what the model already has on this campaign"

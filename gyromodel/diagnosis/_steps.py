@@ -135,11 +135,11 @@ class Steps:
         told = {k: own + v - quality[name] for k, v in quality.items()}
         return replace(ranking, statistic=ranking.statistic | told, fitted=frozenset(told))
 
-    def fits_better(self, found: Sequence[Found], other: Sequence[Found], by: float = 0.0) -> bool:
-        """Whether some steps fit better than others, by some nats, on the data that both keep."""
+    def fits_better(self, found: Sequence[Found], other: Sequence[Found]) -> bool:
+        """Whether some steps fit better than others, on the data that both keep."""
         given_up = Found("", None, rows_of([*found, *other]), found[0].ranking)
         one, two = (self.fit([*steps, given_up]) for steps in (found, other))
-        return one is not None and (two is None or bool(_quality(one) > _quality(two) + by))
+        return one is not None and (two is None or bool(_quality(one) > _quality(two)))
 
     def _has_shape(self, name: str) -> bool:
         """Whether a candidate's shape goes on between the forms searched; a fit of a platform takes too long for it."""

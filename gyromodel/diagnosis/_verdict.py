@@ -81,7 +81,9 @@ def credible(
     too_close = statistic < TIME_MARGIN and ranking.slow_noise and like(scanner, ranking, name, SLOW_IN_TIME)
     if name not in ("outliers", "bias_step", "bias_periodic") and not is_noise(name):
         # Only the number of forms and coefficients sets them apart, which is no evidence.
-        own |= {k: max(own.get(k, 0.0), own[name]) for k in twins(scanner, ranking, name) - apart}
+        of_data = own[name] + scanner.bank.price(name)
+        same = {k: of_data - scanner.bank.price(k) for k in twins(scanner, ranking, name) - apart}
+        own |= {k: max(own.get(k, 0.0), value) for k, value in same.items()}
     # A drift comes back with the next run, and a step does not.
     if (scanner.runs < 2 or name == "bias_step") and (hidden or too_close):
         own["noise_random_walk"] = max(0.0, statistic - 1.0)
@@ -194,7 +196,9 @@ def judge(
             findings.append(f"{name} is in the simulation, but not in this form: the extended model has it whole.")
         if name == "scale_factor":
             findings.append("A scale error of the rate table would look the same: check it against a second reference.")
-        close = _close_rival(step, members)
+        if (odds := -scanner.bank.price(name)) > 0.0:
+            findings.append(f"Of the evidence for {name}, {odds:.1f} nats are prior odds: every gyro has one.")
+        close = _close_rival(step, {*members, *beside})
         findings += [close] if close else []
         turn = sum(f.name == name for f in found[i:])
         least = steps.least(ranking, name)
@@ -379,12 +383,12 @@ def with_noise(judgement: Judgement, beyond: Sequence[Cause], trials: int) -> Ju
     return replace(judgement, causes=causes)
 
 
-def _close_rival(step: Found, members: dict[str, float]) -> str | None:
-    """A sentence where another name was nearly as likely when this one was added, and a later step ruled it out."""
+def _close_rival(step: Found, told: set[str]) -> str | None:
+    """A sentence where a name that is not told was nearly as likely at first, and a later step ruled it out."""
     statistic = step.ranking.statistic
     rivals = {k: v for k, v in statistic.items() if k not in (step.name, "outliers") and not is_driver(k)}
     rival = max(rivals, key=lambda k: rivals[k], default=None)
-    if rival is None or rival in members or step.name in _supersedes(rival) or rival in _supersedes(step.name):
+    if rival is None or rival in told or step.name in _supersedes(rival) or rival in _supersedes(step.name):
         return None
     lead = statistic.get(step.name, np.inf) - rivals[rival]
     if not 0 <= lead < -np.log(1.0 / CREDIBLE - 1.0):

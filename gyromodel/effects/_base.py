@@ -75,7 +75,7 @@ class Effect(eqx.Module):
     coefficients `part` are shares, from none to all; `scan` names a fast search over
     every epoch or frequency; `untested` says why a campaign leaves it no `candidates`; `remembers` that a sample's
     contribution depends on its neighbours in time; `reach` is the largest amplitude (internal units) of an effect that
-    continues others; `odds` are the prior odds on it against any other effect.
+    continues others; `odds` are the prior odds on it against any other effect, and against nothing.
     """
 
     id: ClassVar[str]
