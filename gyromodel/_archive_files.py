@@ -11,7 +11,10 @@ from gyromodel._console import print_table, progress_bar
 from gyromodel.batch import (
     Batch,
     Parameter,
+    PooledEffect,
     copies,
+    pooled_effects,
+    pooled_sentences,
     pooled_table,
     read_results,
     run_batch,
@@ -33,8 +36,8 @@ def batch_to(archive: str, model: Path, output: Path, diagnosing: bool, workers:
         )  # fmt: skip
 
 
-def units_of(results: Path, output: Path | None) -> Sequence[Parameter]:
-    """What a table says of each parameter; the campaigns' parameters as all units tell them are written."""
+def units_of(results: Path, output: Path | None) -> tuple[list[Parameter], list[PooledEffect]]:
+    """What a table says of each parameter and effect; the campaigns' parameters as all units tell them are written."""
     table = read_results(results)
     found = unit_statistics(table)
     if twice := copies(table):
@@ -42,19 +45,21 @@ def units_of(results: Path, output: Path | None) -> Sequence[Parameter]:
     if output:
         output.parent.mkdir(parents=True, exist_ok=True)
         write_table(pooled_table(table, found), output)
-    return found
+    return found, pooled_effects(table)
 
 
-def print_units(found: Sequence[Parameter]) -> None:
+def print_units(found: Sequence[Parameter], effects: Sequence[PooledEffect]) -> None:
     """A table, and what stands out."""
     if not found:
         print("Nothing to compare: no parameter has standard uncertainties in two campaigns.")
-        return
     rows = [
         (f"{s.parameter}{' ' * bool(s.axis)}{s.axis}", str(s.units), str(s.campaigns),
          with_uncertainty(s.mean, s.mean_std, s.unit), number(s.between.value, 3), number(s.within.value, 3))
         for s in found
     ]  # fmt: skip
-    print_table(("parameter", "units", "campaigns", "mean", "unit to unit", "campaign to campaign"), rows)
+    if rows:
+        print_table(("parameter", "units", "campaigns", "mean", "unit to unit", "campaign to campaign"), rows)
     for line in (line for statistics in found for line in statistics.sentences()):
+        print(f"- {line}")
+    for line in pooled_sentences(effects):
         print(f"- {line}")

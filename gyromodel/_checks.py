@@ -19,6 +19,8 @@ KINDS = ("rate", "increment", "angle")
 MAX_METADATA = 10_000
 # A step in time of more than this many nominal ones leaves out samples.
 MISSING_STEP = 1.5
+# Of time, in the unit of its column; one over the square of what is shorter than 1e-154 is no number.
+SHORTEST_STEP = 1e-15
 
 # What the unit of a known column must measure, by examples: one of their dimensions is required.
 _EXPECTED = tuple(
@@ -103,10 +105,10 @@ def of_usual_unit(name: str, unit: str) -> bool:
 
 
 def check_time(time: np.ndarray, first_row: int = 1, previous: float | None = None) -> None:
-    """Check that time is known and strictly increasing.
+    """Check that time is known and strictly increasing, by SHORTEST_STEP or more.
 
     Args:
-        time: the values, or a later part of them.
+        time: the values, or a later part of them, in the unit of their column.
         first_row: data row of the first value.
         previous: the value before the first, if any.
 
@@ -120,7 +122,7 @@ def check_time(time: np.ndarray, first_row: int = 1, previous: float | None = No
         )
     if previous is not None:
         time, first_row = np.concatenate(([previous], time)), first_row - 1
-    if (wrong := time[1:] <= time[:-1]).any():
+    if (wrong := time[1:] - time[:-1] < SHORTEST_STEP).any():
         row = first(wrong)
         raise CampaignError(
             f"column 'time' must increase from row to row, but is {time[row - 1]} at data row {first_row + row - 1} "

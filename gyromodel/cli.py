@@ -373,16 +373,17 @@ def units(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Tell how the units of an archive spread, which stand out, and which drift."""
+    """Tell how the units of an archive spread, which stand out or drift, and what all lack together."""
     if output:
         refuse_overwriting(output, [results])
     from gyromodel._archive_files import print_units, units_of
 
-    found = units_of(results, output)
+    found, effects = units_of(results, output)
     if as_json:
-        print(json_text([statistics.to_dict() for statistics in found]), end="")
+        parameters = [statistics.to_dict() for statistics in found]
+        print(json_text({"parameters": parameters, "effects": [effect.to_dict() for effect in effects]}), end="")
     else:
-        print_units(found)
+        print_units(found, effects)
 
 
 @app.command()

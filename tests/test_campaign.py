@@ -179,6 +179,7 @@ def test_a_campaign_is_no_key():
     [
         ({"time": [0, 0.1, 0.2, 0.2, 0.4, 0.5]}, {}, r"0\.2 at data row 3 and 0\.2 at data row 4 \(row 1 is the first"),
         ({"time": [0, 0.1, 0.2, 0.1, 0.4, 0.5]}, {}, r"is 0\.2 at data row 3 and 0\.1 at data row 4"),
+        ({"time": [0, 1e-320, 0.2, 0.3, 0.4, 0.5]}, {}, "is 0.0 at data row 1 and 1e-320 at data row 2"),
         ({"time": [0, 0.1, NAN, 0.3, 0.4, 0.5]}, {}, "column 'time' is nan at data row 3"),
         ({"time": [0, 0.1, 0.2, 0.3, 0.4, np.inf]}, {}, "column 'time' is inf at data row 6"),
         ({"rate": [0, 1, 2, np.inf, 4, 5]}, {}, "column 'rate' has an infinite value at data row 4"),

@@ -149,6 +149,7 @@ def made(campaign: Campaign, error: np.ndarray, noise: float, rng: np.random.Gen
             "noise_random_walk": {"value": 4e-4, "lo": 0.0, "hi": 1.1e-3, "unit": "deg/h/sqrt(h)"},
         },
         "noise_kinds": {"noise_white": 0.71, "noise_white + noise_random_walk": 0.27},
+        "evidence": {"bias_temperature_rate": (203.1, 205.0, 204.2, 203.2), "bias_drift": (-1.0, -2.1, -3.2, -4.4)},
         "rounds": (
             Round("bias_temperature_rate", 212.4, ranking, spread[1], 180.2),
             Round(None, 0.4, rest, spread[1], 180.2),

@@ -151,10 +151,11 @@ def test_three_stages_state_the_scatter_of_what_they_end_in(rng: np.random.Gener
     assert chi2.ppf(1e-6, 24) < sum(distance) < chi2.ppf(1 - 1e-6, 24)
     last = sum(((a.vector - true)[1] / a.std[1]) ** 2 for a, _ in found)
     assert chi2.ppf(1e-6, 12) < last < chi2.ppf(1 - 1e-6, 12)
-    angle, apart = found[0]
-    assert set(angle.budget()) == {"thermometry", "campaign"}
-    assert angle.budget()["thermometry"][1] > 0.2
-    assert angle.std[1] < 0.4 * apart, "an error of the thermistor that both stages share cancels in part"
+    assert all(set(angle.budget()) == {"thermometry", "campaign"} for angle, _ in found)
+    # Medians: of one history in thirty the thermometer's own share is below 0.2.
+    assert np.median([angle.budget()["thermometry"][1] for angle, _ in found]) > 0.25
+    shared = np.median([angle.std[1] / apart for angle, apart in found])
+    assert shared < 0.35, "an error of the thermistor that both stages share cancels in part"
 
 
 def offset_line(p, x, model):

@@ -23,7 +23,7 @@ from gyromodel.batch._archive import Entry
 SCHEMA = pa.schema(
     [(name, pa.string()) for name in ("campaign", "axis", "parameter")]
     + [(name, pa.float64()) for name in ("value", "std", "low", "high")]
-    + [(name, pa.string()) for name in ("unit", "status", "reason", "verdict", "causes")]
+    + [(name, pa.string()) for name in ("unit", "status", "reason", "verdict", "causes", "evidence")]
     + [("gain_ratio", pa.float64()), ("samples", pa.int64()), ("iterations", pa.int64())]
     + [(name, pa.string()) for name in ("serial", "date", "data_hash", "model_hash", "version", "file_state")]
 )

@@ -223,15 +223,16 @@ def _statistics(rows: _Rows) -> Parameter | None:
     pooled = {name: x * scale + shift * (name != "std") for name, x in _pooled(value, std, rows.unit, p).items()}
     return Parameter(
         rows.parameter, rows.axis, rows.unit_text, mean * scale + shift, mean_std * scale,
-        _spread(p.between * scale, p.weight) if len(rows.names) > 1 else UNKNOWN,
-        _spread(p.within * scale, p.weight) if len(rows.names) < len(value) else UNKNOWN,
+        spread_of(p.between * scale, p.weight) if len(rows.names) > 1 else UNKNOWN,
+        spread_of(p.within * scale, p.weight) if len(rows.names) < len(value) else UNKNOWN,
         len(rows.names), len(value),
         tuple(_outliers(rows, value, std, scale, shift)), tuple(_drifts(rows)),
         {"row": rows.index, **pooled},
     )  # fmt: skip
 
 
-def _spread(levels: np.ndarray, weight: np.ndarray) -> Spread:
+def spread_of(levels: np.ndarray, weight: np.ndarray) -> Spread:
+    """Median and 95 % interval of weighted levels."""
     order = np.argsort(levels)
     total = np.cumsum(weight[order])
     low, middle, high = (float(levels[order][np.searchsorted(total, q * total[-1])]) for q in (0.025, 0.5, 0.975))

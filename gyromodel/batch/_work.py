@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -131,6 +132,7 @@ def _rows(one: Ready, lot: Lot) -> list[Row]:
                 "status": "diagnosed",
                 "verdict": diagnosis.verdict,
                 "causes": ", ".join(cause.effect for cause in diagnosis.causes),
+                "evidence": json.dumps({k: [round(x, 3) for x in v] for k, v in diagnosis.evidence.items()}),
                 "gain_ratio": _known(diagnosis.gain.ratio),
                 "reason": None if common else OWN,
             }

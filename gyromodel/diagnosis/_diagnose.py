@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -241,6 +241,7 @@ def diagnose(
         not_testable=not_testable(session.scanner, selection.last, selection.estimate.model, sizes),
         noise=extended.noise_table(),
         noise_kinds={} if baseline.noise_given else noise_kinds(session.scanner, selection.last),
+        evidence=_evidence(selection, judgement.credible_set),
         rounds=_rounds(session, selection, scale, hold_out),
         credible_set=judgement.credible_set,
         unexplained=judgement.unexplained,
@@ -334,6 +335,18 @@ def _more_needed(first: Ranking, path: Sequence[Found]) -> float:
     """Nats that the first name, or the leading one where none was added, needed more."""
     name = path[0].name if path else first.best(drivers=False)[0]
     return first.more_needed(name) if name else 0.0
+
+
+def _evidence(selection: Selection, alike: Mapping[str, float]) -> dict[str, tuple[float, ...]]:
+    """ln B at each of the prior's sizes beside all that was found; of that, and of what is alike, as it was added.
+
+    Gross errors are a campaign's own.
+    """
+    of = dict.fromkeys(selection.last.statistic, selection.last)
+    for f in reversed(selection.found):
+        rivals = alike if f.name in alike else ()
+        of |= {name: f.ranking for name in (*rivals, f.name) if name in f.ranking.statistic}
+    return {name: ranking.at_sizes(name) for name, ranking in sorted(of.items()) if name != "outliers"}
 
 
 def _p_value(selection: Selection, nulls: np.ndarray) -> float:

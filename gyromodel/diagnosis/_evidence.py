@@ -17,12 +17,19 @@ SAFE_THRESHOLD = 4.0
 
 def log_evidence_ratio(t: np.ndarray, rss: np.ndarray | float, nu: int, q: np.ndarray | int) -> np.ndarray:
     """ln B of adding q columns that explain `t` of the residual sum `rss` with ν degrees of freedom."""
+    each = log_evidence_at_sizes(t, rss, nu, q)
+    top = np.maximum.reduce(each)
+    return np.asarray(top + np.log(sum(np.exp(e - top) for e in each) / len(SIZES)))
+
+
+def log_evidence_at_sizes(
+    t: np.ndarray | float, rss: np.ndarray | float, nu: int, q: np.ndarray | float
+) -> list[np.ndarray]:
+    """As `log_evidence_ratio`, at each of the prior's sizes t²."""
     part = np.clip(t / rss, 0.0, 1.0)
     half = 0.5 * np.asarray(q, float)
     # Plain log and exp, which processors vectorise; 1 − part loses nothing that matters times ν.
-    each = [-0.5 * nu * np.log(1.0 - size / (1.0 + size) * part) - half * np.log1p(size) for size in SIZES]
-    top = np.maximum.reduce(each)
-    return np.asarray(top + np.log(sum(np.exp(e - top) for e in each) / len(SIZES)))
+    return [-0.5 * nu * np.log(1.0 - size / (1.0 + size) * part) - half * np.log1p(size) for size in SIZES]
 
 
 def explained_for(log_ratio: float, nu: int, q: int) -> float:

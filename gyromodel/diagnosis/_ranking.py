@@ -12,7 +12,7 @@ from gyromodel._checks import thermometers
 from gyromodel.diagnosis._bank import Bank
 from gyromodel.diagnosis._batch import CellResult
 from gyromodel.diagnosis._drivers import RESPONSE_DRIVER
-from gyromodel.diagnosis._evidence import log_sum
+from gyromodel.diagnosis._evidence import SIZES, log_evidence_at_sizes, log_mean, log_sum
 from gyromodel.diagnosis._lines import lines_of
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._tangents import Tangent
@@ -88,6 +88,22 @@ class Ranking:
     def needs_a_walk(self, name: str) -> bool:
         """Whether a candidate has to show beside noise with a random walk as well."""
         return any(self.walks.values()) and name not in EXEMPT and not is_noise(name)
+
+    def at_sizes(self, name: str) -> tuple[float, ...]:
+        """ln B of a candidate, less what it needs more, at each of the prior's `SIZES`.
+
+        Shapes count at each size as they do at all; kinds of noise, whose size has no prior, are the same at each.
+        """
+        cells = {g: r for g, r in self.results.items() if name in r.best}
+        if is_noise(name) or not cells:
+            return (self.statistic[name],) * len(SIZES)
+        nu, logs = self.samples - self.baseline_columns.shape[1], []
+        for g, r in cells.items():
+            _, explained, dimension = r.best[name]
+            each = np.array(log_evidence_at_sizes(explained, r.rss, nu, dimension))
+            logs.append(r.log_likelihood + self.log_prior[g] + r.evidence[name] + each - log_mean(each))
+        sizes = np.array([log_sum(of_size) for of_size in np.transpose(logs)])
+        return tuple(map(float, sizes - log_mean(sizes) + self.statistic[name] - self.more_needed(name)))
 
     def best_cell(self, name: str | None = None) -> int:
         """The noise cell of most weight, with a candidate added or with none."""

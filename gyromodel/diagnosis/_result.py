@@ -111,8 +111,10 @@ class Diagnosis:
     """The whole answer; arrays have one entry per campaign row, residuals are measured minus model as a rate.
 
     `noise_kinds` is the posterior over what the noise is made of, "noise_white" alone or more joined by " + "; empty
-    where the model states it. `p_value` is the chance that a campaign of this design with nothing hidden shows as much
-    evidence as this one; None if the threshold was not calibrated.
+    where the model states it. `evidence` is ln B of each candidate beside what was found, and of what was found and
+    what is alike as it was added, less what it needs more than others, for coefficients of √10, 10, √1000 and 100
+    standard errors: an archive adds it up over its units. `p_value` is the chance that a campaign of this design with
+    nothing hidden shows as much evidence as this one; None if the threshold was not calibrated.
     """
 
     verdict: Verdict
@@ -124,6 +126,7 @@ class Diagnosis:
     not_testable: Mapping[str, str]
     noise: Mapping[str, Mapping[str, float | str]]
     noise_kinds: Mapping[str, float]
+    evidence: Mapping[str, tuple[float, ...]]
     rounds: tuple[Round, ...]
     credible_set: Mapping[str, float]
     unexplained: Mapping[str, float]
@@ -159,6 +162,7 @@ class Diagnosis:
             "not_testable": dict(self.not_testable),
             "noise": {k: dict(v) for k, v in self.noise.items()},
             "noise_kinds": dict(self.noise_kinds),
+            "evidence": {k: list(v) for k, v in self.evidence.items()},
             "credible_set": dict(self.credible_set),
             "unexplained": dict(self.unexplained),
             "findings": list(self.findings),
