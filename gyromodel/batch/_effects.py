@@ -71,14 +71,15 @@ def _of(axis: str, campaigns: pd.DataFrame) -> list[PooledEffect]:
     names: dict[str, None] = {}
     units: dict[str, dict[str, np.ndarray]] = {}
     named: dict[str, set[str]] = {}
-    for row in campaigns.itertuples():
-        unit = units.setdefault(str(row.serial), {})
-        for name, logs in json.loads(str(row.evidence)).items():
+    columns = (campaigns[name] for name in ("serial", "verdict", "causes", "evidence"))
+    for serial, verdict, causes, evidence in zip(*columns, strict=True):
+        unit = units.setdefault(serial, {})
+        for name, logs in json.loads(evidence).items():
             names.setdefault(name)
             unit[name] = unit.get(name, 0.0) + np.array(logs)
-        if row.verdict == "named":
-            for name in str(row.causes).split(", "):
-                named.setdefault(name, set()).add(str(row.serial))
+        if verdict == "named":
+            for name in causes.split(", "):
+                named.setdefault(name, set()).add(serial)
     found = [_pooled(name, axis, units, len(named.get(name, ()))) for name in names]
     weight = np.array([e.evidence - UNLISTED * e.effect.startswith("smooth(") for e in found])
     posterior = np.exp(weight - logsumexp(weight)) if len(found) else weight
