@@ -20,7 +20,7 @@ MAX_METADATA = 10_000
 # A step in time of more than this many nominal ones leaves out samples.
 MISSING_STEP = 1.5
 # Of time, in the unit of its column; one over the square of what is shorter than 1e-154 is no number.
-SHORTEST_STEP = 1e-15
+SHORTEST_STEP = 1e-100
 
 # What the unit of a known column must measure, by examples: one of their dimensions is required.
 _EXPECTED = tuple(

@@ -29,8 +29,9 @@ from gyromodel.diagnosis._evidence import SAFE_THRESHOLD, SIZES, explained_for, 
 from gyromodel.diagnosis._forms import step_at
 from gyromodel.diagnosis._pairs import best_pair
 from gyromodel.diagnosis._ranking import rank
+from gyromodel.diagnosis._said import _places
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._verdict import _as_set, _places
+from gyromodel.diagnosis._verdict import _as_set
 from gyromodel.effects.drivers import BiasStep
 from gyromodel.effects.thermal import BiasWarmup
 from gyromodel.estimate import EstimateError, fit_record

@@ -7,6 +7,7 @@ are ranked alike) and over the candidate's shapes (which is the price of the sea
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -23,8 +24,8 @@ def log_evidence_ratio(t: np.ndarray, rss: np.ndarray | float, nu: int, q: np.nd
 
 
 def log_evidence_at_sizes(
-    t: np.ndarray | float, rss: np.ndarray | float, nu: int, q: np.ndarray | float
-) -> list[np.ndarray]:
+    t: np.ndarray | float, rss: np.ndarray | float, nu: int, q: np.ndarray | float | int
+) -> list[Any]:
     """As `log_evidence_ratio`, at each of the prior's sizes t²."""
     part = np.clip(t / rss, 0.0, 1.0)
     half = 0.5 * np.asarray(q, float)

@@ -20,7 +20,7 @@ from gyromodel.effects import CATALOGUE
 from gyromodel.effects._base import evaluate
 from gyromodel.effects.drivers import BiasColumn
 from gyromodel.estimate import Estimate
-from gyromodel.model import GyroModel
+from gyromodel.model import GyroModel, effect_class
 from gyromodel.noise import markov_cells, restricted_likelihood
 
 # Cells within this many nats of the best, for any candidate that matters, get their neighbours searched too: those
@@ -79,8 +79,12 @@ class Ranking:
 
         A walk too weak to show still imitates what changes slowly.
         """
+        return self._lost_to_a_walk(name) if self.needs_a_walk(name) else 0.0
+
+    def _lost_to_a_walk(self, name: str) -> float:
+        """Nats that a candidate would lose were it known that the noise has a random walk."""
         walks = [g for g, there in self.walks.items() if there]
-        if not self.needs_a_walk(name):
+        if not walks:
             return 0.0
         every, among = (evidence_in(self.results, cells, self.log_prior, name) for cells in (self.results, walks))
         return max(every - among, 0.0) if np.isfinite(among) else 0.0
@@ -90,7 +94,7 @@ class Ranking:
         return any(self.walks.values()) and name not in EXEMPT and not is_noise(name)
 
     def at_sizes(self, name: str) -> tuple[float, ...]:
-        """ln B of a candidate, less what it needs more, at each of the prior's `SIZES`.
+        """ln B of a candidate at each of the prior's `SIZES`, less what a random walk would take of any, slow or not.
 
         Shapes count at each size as they do at all; kinds of noise, whose size has no prior, are the same at each.
         """
@@ -103,7 +107,7 @@ class Ranking:
             each = np.array(log_evidence_at_sizes(explained, r.rss, nu, dimension))
             logs.append(r.log_likelihood + self.log_prior[g] + r.evidence[name] + each - log_mean(each))
         sizes = np.array([log_sum(of_size) for of_size in np.transpose(logs)])
-        return tuple(map(float, sizes - log_mean(sizes) + self.statistic[name] - self.more_needed(name)))
+        return tuple(map(float, sizes - log_mean(sizes) + self.statistic[name] - self._lost_to_a_walk(name)))
 
     def best_cell(self, name: str | None = None) -> int:
         """The noise cell of most weight, with a candidate added or with none."""
@@ -155,6 +159,11 @@ def is_driver(name: str) -> bool:
 def is_noise(name: str) -> bool:
     """Whether a candidate is a kind of noise."""
     return name.startswith("noise_")
+
+
+def supersedes(name: str) -> tuple[str, ...]:
+    """The special cases that a candidate contains."""
+    return () if name == "outliers" or is_noise(name) else effect_class(name).supersedes
 
 
 def rank(

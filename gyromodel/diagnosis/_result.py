@@ -11,6 +11,11 @@ import numpy as np
 from gyromodel.campaign import Campaign
 from gyromodel.estimate import Estimate
 
+# Share of the posterior that the credible set holds.
+CREDIBLE = 0.95
+# Standard uncertainties from which on a parameter has a size.
+VAGUE = 2.0
+
 Verdict = Literal["adequate", "named", "ambiguous", "unknown"]
 
 
@@ -112,9 +117,9 @@ class Diagnosis:
 
     `noise_kinds` is the posterior over what the noise is made of, "noise_white" alone or more joined by " + "; empty
     where the model states it. `evidence` is ln B of each candidate beside what was found, and of what was found and
-    what is alike as it was added, less what it needs more than others, for coefficients of √10, 10, √1000 and 100
-    standard errors: an archive adds it up over its units. `p_value` is the chance that a campaign of this design with
-    nothing hidden shows as much evidence as this one; None if the threshold was not calibrated.
+    what is alike as it was added, less what a random walk would take of it, for coefficients of √10, 10, √1000 and
+    100 standard errors: an archive adds it up over its units. `p_value` is the chance that a campaign of this design
+    with nothing hidden shows as much evidence as this one; None if the threshold was not calibrated.
     """
 
     verdict: Verdict

@@ -7,46 +7,37 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gyromodel._checks import listed, thermometers
+from gyromodel._checks import thermometers
 from gyromodel.campaign import Campaign
 from gyromodel.declarations import EARLIER, RATE_OF, measured
 from gyromodel.diagnosis._apart import like, twins
 from gyromodel.diagnosis._causes import cause_of
 from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._exchange import uncontested
-from gyromodel.diagnosis._lines import lines_of
 from gyromodel.diagnosis._points import levels
-from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, is_driver, is_noise
-from gyromodel.diagnosis._result import Cause, ParameterValue, Verdict
+from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, is_driver, is_noise, supersedes
+from gyromodel.diagnosis._result import CREDIBLE, VAGUE, Cause, ParameterValue, Verdict
+from gyromodel.diagnosis._said import told, told_of_cause, told_of_rest
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import TIME_MARGIN, Selection
 from gyromodel.diagnosis._shapes import remaining
 from gyromodel.diagnosis._steps import Found, Steps
 from gyromodel.diagnosis._variance import quantum
-from gyromodel.effects import Effect
 from gyromodel.effects._shapes import beyond_earth
-from gyromodel.effects.drivers import BiasPeriodic, BiasStep
+from gyromodel.effects.drivers import BiasPeriodic
 from gyromodel.estimate import Estimate
 from gyromodel.model import effect_class
 from gyromodel.signals import Record
 from gyromodel.units import factor
 
-# Share of the posterior that the credible set holds.
-CREDIBLE = 0.95
 # Where the noise is slow even with them, these have no edge that a random walk could not make, whatever their lead.
 NO_EDGE = ("bias_drift", "bias_warmup")
-# Standard uncertainties from which on a parameter has a size.
-VAGUE = 2.0
 # Times the saw tooth of rounding that a line of its making may be, and steps over which the output has to move for it.
 ROUNDED = 2.0
 # Nats below which a cause is faint, and times that by which a stronger one of the same thermometer outdoes it.
 FAINT, OUTDONE = 10.0, 10.0
-# Parts of an interval by which samples may be off a regular grid before they tell a line from its aliases.
-IRREGULAR = 0.01
 # What makes lines at each harmonic of a ramp, of which its form holds a few.
 CODES = "bias_readout_code"
-# Gross errors that are listed by row.
-ROWS_TOLD = 12
 # A driver that names leave with more than this share of the structure makes the discrepancy unknown.
 UNKNOWN_SHARE = 0.05
 # So does one with more than this part of the strongest name's evidence: names that follow one another never end it.
@@ -98,27 +89,12 @@ def credible(
     # A special case that does as well is enough. Where what was found contains it and does better, but not surely, both
     # stand: whether there is more than the special case is then not known.
     for k in list(chosen):
-        general = next((m for m in chosen if m not in (k, name) and k in _supersedes(m)), None)
+        general = next((m for m in chosen if m not in (k, name) and k in supersedes(m)), None)
         if general and k in chosen:
             loser = min((k, general), key=lambda n: (n == name, chosen[n]))
             chosen[general if loser == k else k] += chosen.pop(loser)
     # What was added and is not among the likeliest is in doubt with them.
     return chosen if name in chosen else chosen | {name: weight[name] / total}
-
-
-def _in_campaign(effect: Effect | None) -> str:
-    """Which of several campaigns a step or lines are in."""
-    if isinstance(effect, BiasStep) and effect.campaign:
-        return f"The step found is in campaign {effect.campaign}."
-    if isinstance(effect, BiasPeriodic) and effect.campaigns:
-        return f"The lines found are in campaigns {', '.join(map(str, effect.campaigns))}, in this order."
-    return ""
-
-
-def _supersedes(name: str) -> tuple[str, ...]:
-    if name == "outliers" or name.startswith("noise_"):
-        return ()
-    return effect_class(name).supersedes
 
 
 def judge(
@@ -130,128 +106,45 @@ def judge(
     searched: Sequence[tuple[Campaign, bool]],
 ) -> Judgement:
     """The verdict on a finished search; `searched`: the record's campaigns, and whether they are as given."""
-    scanner, baseline, record = steps.scanner, steps.baseline, steps.scanner.record
-    found = list(selection.found)
-    causes, sets, findings = [], [], []
-    given_up = sorted(row for step in found for row in step.points)
-    dwells = [] if scanner.by_points else scanner.points_among(given_up)
-    if dwells:
-        what = f"{len(dwells)} whole dwells, which begin" if len(dwells) > 1 else "A whole dwell, which begins"
-        findings.append(f"{what} {_places([int(d[0]) for d in dwells], searched)}: given up, not modelled.")
-    of_dwells = {int(row) for dwell in dwells for row in dwell}
-    errors = [] if scanner.by_points else [row for row in given_up if row not in of_dwells]
-    if errors:
-        what = f"{len(errors)} gross errors" if len(errors) > 1 else "A gross error"
-        findings.append(f"{what} {_places(errors, searched)}: given up, not modelled.")
-    for one, other in zip(selection.path, selection.path[1:], strict=False):
-        if one.paired and {one.name, other.name} <= {step.name for step in found}:
-            findings.append(
-                f"{one.name} and {other.name} show together and hardly alone: much alike on this campaign, they all "
-                "but cancel."
-            )
-    for step in (f for f in found if f.rows and not f.points):
-        findings.append(
-            f"{len(step.rows)} samples next to gaps or the record's ends were left out beside {step.name}: what was "
-            "not recorded still shows there."
-        )
-    findings += [line for step in found if (line := _in_campaign(step.effect))]
-    if any(isinstance(step.effect, BiasPeriodic) for step in found) and (also := _aliases(extended)):
-        findings.append(also)
-    held: dict[str, list[str]] = {}
-    for label, shape in sorted(extended.model.fixed - baseline.model.fixed):
-        held.setdefault(label, []).append(shape)
-    findings += [
-        f"{' and '.join(shapes)} of {label} stayed where the search had put them, as they could not be estimated: the "
-        "other uncertainties are those for just these values."
-        for label, shapes in held.items()
-    ]
-    for i, step in enumerate(found):
-        ranking, name = selection.left_out.get(i), step.name
-        # What grew is judged whole.
-        grew = sum(f.name == name for f in selection.path) > sum(f.name == name for f in found)
-        if ranking is None and (len(found) > 1 or grew) and not uncontested(step):
-            rest = steps.all_but(found, i)
-            ranking = rest[1] if rest else None
-        if ranking is None or name not in ranking.statistic:
-            ranking = step.ranking
-        statistic = ranking.statistic[name]
-        beside = frozenset(f.name for f in found if f is not step)
-        # What was not added may stand in the place of this.
-        members = credible(scanner, ranking, name, statistic, beside=beside - {selection.remains})
-        if name == "outliers":
-            bad = np.array([np.isin(p, step.points).all() for p in scanner.points], bool)
-            in_a_row = not scanner.by_points and (bad[:-2] & bad[1:-1] & bad[2:]).any()
-            doubts = {"scale_spline": _unrepeated(scanner, bad), "bias_step": in_a_row and scanner.steps}
-            rivals = [k for k, possible in doubts.items() if possible]
-            if rivals:
-                own = {k: 0.5 * share for k, share in members.items()}
-                members = own | {k: 0.5 / len(rivals) + own.get(k, 0.0) for k in rivals}
-            elif not scanner.by_points:
-                continue
-        if isinstance(step.effect, BiasPeriodic) and _of_rounding(extended):
-            members = {k: 0.5 * share for k, share in members.items()} | {"noise_quantisation": 0.5}
-        if name in baseline.model.wholly_fixed():
-            findings.append(f"{name} is fixed in the simulation at a value that the data contradict: it was set free.")
-        elif step.grows and name in baseline.model.labels:
-            findings.append(f"{name} is in the simulation, but not in this form: the extended model has it whole.")
-        if name == "scale_factor":
-            findings.append("A scale error of the rate table would look the same: check it against a second reference.")
-        if (odds := -scanner.bank.price(name)) > 0.0:
-            findings.append(f"Of the evidence for {name}, {odds:.1f} nats are prior odds: every gyro has one.")
-        close = _close_rival(step, {*members, *beside})
-        findings += [close] if close else []
-        turn = sum(f.name == name for f in found[i:])
-        least = steps.least(ranking, name)
+    scanner, last = steps.scanner, selection.last
+    findings = list(told(steps, selection, extended, searched))
+    causes, sets = [], []
+    for i, step in enumerate(selection.found):
+        ranking = _ranking_of(steps, selection, i)
+        members = _members(steps, selection, extended, step, ranking)
+        if not members:
+            continue
+        beside = {f.name for f in selection.found if f is not step}
+        findings += told_of_cause(steps, step, extended, {*members, *beside})
+        turn = sum(f.name == step.name for f in selection.found[i:])
+        least, statistic = steps.least(ranking, step.name), ranking.statistic[step.name]
         causes.append(cause_of(scanner, extended, step, turn, ranking, members, statistic, trials, null_scores, least))
         sets.append(members)
-    # Of these only something in common has a size: which of them it is, this campaign cannot tell.
-    sizes = [_fitted(c) for c in causes]
-    vague = [c.effect for c, s in zip(causes, sizes, strict=True) if any(p.std for p in s) and not any(map(_sized, s))]
-    if len(vague) > 1:
-        shared = dict.fromkeys(vague, 1.0 / len(vague))
-        sets = [members | shared if c.effect in vague else members for c, members in zip(causes, sets, strict=True)]
-    sets = [members | _left_by(c, causes, extended, c.effect in vague) if len(members) == 1 else members
-            for c, members in zip(causes, sets, strict=True)]  # fmt: skip
+    sets = _with_doubts(causes, sets, extended)
     order = sorted(range(len(causes)), key=lambda i: -causes[i].statistic)
     causes, sets = [causes[i] for i in order], [sets[i] for i in order]
     if selection.remains and not selection.unresolved:
-        findings.append(
-            f"More remains than was named: {selection.remains} is still significant (ln B = "
-            f"{selection.last.statistic.get(selection.remains, np.nan):.0f}) and was not added. All values are those "
-            f"without it{_moved(extended, selection.beside_it)}."
-        )
-    driver, share = remaining(scanner, baseline, selection)
+        findings.append(told_of_rest(selection, extended))
+    driver, share = remaining(scanner, steps.baseline, selection)
     unexplained = {" and ".join(smooth_columns(driver)): share} if driver else {}
+
+    def judged(verdict: Verdict, causes: Sequence[Cause], credible: dict[str, float], **more: str | None) -> Judgement:
+        what = {"driver": None, "next_test": None} | more
+        return Judgement(verdict, tuple(causes), credible, unexplained=unexplained, findings=tuple(findings), **what)
+
     strongest = max((c.statistic for c in causes), default=0.0)
-    if driver and (share > UNKNOWN_SHARE or selection.last.statistic[driver] > UNKNOWN_EVIDENCE * strongest):
-        columns = smooth_columns(driver)
-        bases, forms = zip(*(measured(c) for c in columns), strict=True)
-        how = "in steps up and down"
-        if RATE_OF in forms:
-            how = "in ramps of several speeds up and down"
-        elif EARLIER in forms:
-            how = "in steps held until nothing changes any more"
-        test = f"Vary {' and '.join(bases)} alone, {how}, everything else held, and repeat the run."
-        if bases == ("time",):
-            test = "Repeat the run from power-on, everything held: noise does not come back."
-        return Judgement("unknown", tuple(causes), {driver: 1.0}, driver, test, unexplained, tuple(findings))
-    more = selection.last.statistic.get(selection.remains or "", -np.inf)
-    # What encoders of a platform pass for is no cause.
-    all_of_them = strongest if scanner.record.domain == "gyro" else np.inf
-    least = min((c.statistic for c in causes if c.effect == selection.remains), default=all_of_them)
-    # Nor are gross errors.
-    if causes and selection.remains != "outliers" and more > least:
+    if driver and (share > UNKNOWN_SHARE or last.statistic[driver] > UNKNOWN_EVIDENCE * strongest):
+        return judged("unknown", causes, {driver: 1.0}, driver=driver, next_test=_test_of_driver(driver))
+    if _outweighed(causes, selection, scanner.record.domain):
         # A name holds less of what is there than it leaves, in a form that it cannot have; or all of them do.
-        driver, score = selection.last.best(drivers=True)
+        driver, score = last.best(drivers=True)
         driver = driver if score > steps.threshold else None
-        leading = {driver or str(selection.remains): 1.0}
-        return Judgement("unknown", tuple(causes), leading, driver, None, unexplained, tuple(findings))
+        return judged("unknown", causes, {driver or str(selection.remains): 1.0}, driver=driver)
     # Single gross errors are no cause, however many of them a search did not come to.
     if not causes and selection.remains and (scanner.by_points or selection.remains != "outliers"):
-        return Judgement("unknown", (), {selection.remains: 1.0}, None, None, unexplained, tuple(findings))
+        return judged("unknown", (), {selection.remains: 1.0})
     if not causes:
-        return Judgement("adequate", (), {}, None, None, unexplained, tuple(findings))
-    named = tuple(c for c, s in zip(causes, sets, strict=True) if len(s) == 1)
+        return judged("adequate", (), {})
     for cause, members in zip(causes[1:], sets[1:], strict=True):
         if len(members) > 1:
             others = " or ".join(members)
@@ -259,12 +152,81 @@ def judge(
                 f"The extended model also holds {cause.effect}, which this campaign cannot tell from the others of: "
                 f"{others}."
             )
+    named = [c for c, s in zip(causes, sets, strict=True) if len(s) == 1]
     if len(sets[0]) == 1:
-        return Judgement("named", named, sets[0], None, None, unexplained, tuple(findings))
-    doubtful = _as_set(causes[0], sets[0])
-    firm = tuple(c for c in named if c.effect not in sets[0])
-    test = _next_test(list(sets[0]), record, causes[0])
-    return Judgement("ambiguous", (*doubtful, *firm), sets[0], None, test, unexplained, tuple(findings))
+        return judged("named", named, sets[0])
+    firm = [c for c in named if c.effect not in sets[0]]
+    test = _next_test(list(sets[0]), scanner.record, causes[0])
+    return judged("ambiguous", (*_as_set(causes[0], sets[0]), *firm), sets[0], next_test=test)
+
+
+def _ranking_of(steps: Steps, selection: Selection, i: int) -> Ranking:
+    """The ranking that judges what was found i-th: beside all the rest, if that may differ from when it was added."""
+    found, step, ranking = selection.found, selection.found[i], selection.left_out.get(i)
+    # What grew is judged whole.
+    grew = sum(f.name == step.name for f in selection.path) > sum(f.name == step.name for f in found)
+    if ranking is None and (len(found) > 1 or grew) and not uncontested(step):
+        rest = steps.all_but(list(found), i)
+        ranking = rest[1] if rest else None
+    return ranking if ranking is not None and step.name in ranking.statistic else step.ranking
+
+
+def _members(steps: Steps, selection: Selection, extended: Estimate, step: Found, ranking: Ranking) -> dict[str, float]:
+    """The names that may stand for what was found, with their shares; none where it is no cause."""
+    scanner, name = steps.scanner, step.name
+    # What was not added may stand in the place of this.
+    beside = frozenset(f.name for f in selection.found if f is not step) - {selection.remains}
+    members = credible(scanner, ranking, name, ranking.statistic[name], beside=beside)
+    if name == "outliers":
+        bad = np.array([np.isin(p, step.points).all() for p in scanner.points], bool)
+        in_a_row = not scanner.by_points and (bad[:-2] & bad[1:-1] & bad[2:]).any()
+        doubts = {"scale_spline": _unrepeated(scanner, bad), "bias_step": in_a_row and scanner.steps}
+        rivals = [k for k, possible in doubts.items() if possible]
+        if not rivals:
+            return members if scanner.by_points else {}
+        own = {k: 0.5 * share for k, share in members.items()}
+        members = own | {k: 0.5 / len(rivals) + own.get(k, 0.0) for k in rivals}
+    if isinstance(step.effect, BiasPeriodic) and _of_rounding(extended):
+        members = {k: 0.5 * share for k, share in members.items()} | {"noise_quantisation": 0.5}
+    return members
+
+
+def _with_doubts(
+    causes: Sequence[Cause], sets: Sequence[dict[str, float]], extended: Estimate
+) -> list[dict[str, float]]:
+    """Each cause's names, with those that a vague or a faint one may be another's part of."""
+    # Of these only something in common has a size: which of them it is, this campaign cannot tell.
+    sizes = [_fitted(c) for c in causes]
+    vague = [c.effect for c, s in zip(causes, sizes, strict=True) if any(p.std for p in s) and not any(map(_sized, s))]
+    shared = dict.fromkeys(vague, 1.0 / len(vague)) if len(vague) > 1 else {}
+    together = [s | shared if c.effect in vague else s for c, s in zip(causes, sets, strict=True)]
+    return [
+        members | _left_by(c, causes, extended, c.effect in vague) if len(members) == 1 else members
+        for c, members in zip(causes, together, strict=True)
+    ]
+
+
+def _outweighed(causes: Sequence[Cause], selection: Selection, domain: str) -> bool:
+    """Whether what was not added has more evidence than the name it goes by, or than all that was named."""
+    more = selection.last.statistic.get(selection.remains or "", -np.inf)
+    # What encoders of a platform pass for is no cause.
+    all_of_them = max((c.statistic for c in causes), default=0.0) if domain == "gyro" else np.inf
+    least = min((c.statistic for c in causes if c.effect == selection.remains), default=all_of_them)
+    # Nor are gross errors.
+    return bool(causes and selection.remains != "outliers" and more > least)
+
+
+def _test_of_driver(driver: str) -> str:
+    """What to measure of an error that follows some columns and has no name."""
+    bases, forms = zip(*(measured(c) for c in smooth_columns(driver)), strict=True)
+    if bases == ("time",):
+        return "Repeat the run from power-on, everything held: noise does not come back."
+    how = "in steps up and down"
+    if RATE_OF in forms:
+        how = "in ramps of several speeds up and down"
+    elif EARLIER in forms:
+        how = "in steps held until nothing changes any more"
+    return f"Vary {' and '.join(bases)} alone, {how}, everything else held, and repeat the run."
 
 
 def _left_by(cause: Cause, causes: Sequence[Cause], estimate: Estimate, vague: bool) -> dict[str, float]:
@@ -283,19 +245,6 @@ def _left_by(cause: Cause, causes: Sequence[Cause], estimate: Estimate, vague: b
     least = (1.0 if vague else OUTDONE) * cause.statistic
     others = [c for c in causes if c.statistic > least and own & needs.get(c.effect, set())]
     return {max(others, key=lambda c: c.statistic).effect: 0.5} if others else {}
-
-
-def _aliases(estimate: Estimate) -> str:
-    """Where else lines may lie that regular samples show at these frequencies: the nearest two places of each."""
-    record = estimate.record
-    time = np.asarray(record.signals["time"])[: record.rows]
-    steps = np.diff(time)[np.diff(record.run[: record.rows]) == 0]
-    if np.abs(steps / record.interval - np.round(steps / record.interval)).max() > IRREGULAR:
-        return ""
-    sampled = 1.0 / record.interval
-    lines = sorted({line.frequency for line in lines_of(estimate.model)})
-    each = [f"{f:.4g} Hz ({sampled - f:.4g}, {sampled + f:.4g} Hz, …)" for f in lines]
-    return f"Rows every {record.interval:.4g} s cannot tell a line from its aliases: {listed(each)}."
 
 
 def _of_rounding(estimate: Estimate) -> bool:
@@ -321,31 +270,6 @@ def _fitted(cause: Cause) -> list[ParameterValue]:
 
 def _sized(parameter: ParameterValue) -> bool:
     return bool(0.0 < VAGUE * parameter.std < abs(parameter.value))
-
-
-def _moved(estimate: Estimate, other: Estimate | None) -> str:
-    """What other values another fit has, of those that it moves by more than chance."""
-    there = {(r.effect, r.name): r for r in other.table()} if other else {}
-    pairs = [(r, there[r.effect, r.name]) for r in estimate.table() if (r.effect, r.name) in there]
-    said = [
-        f"{r.name} of {r.effect} would be ({o.value:.5g} ± {o.std:.2g}) {o.unit}"
-        for r, o in pairs
-        if r.std and abs(o.value - r.value) > VAGUE * r.std
-    ]
-    return f"; with it {listed(said)}" if said else ""
-
-
-def _places(rows: Sequence[int], searched: Sequence[tuple[Campaign, bool]]) -> str:
-    """Where rows of the record are in the files: by row, or by time where rows were left out or averaged."""
-    begins = np.cumsum([0, *(len(c) for c, _ in searched)])
-    by_row, some = all(as_given for _, as_given in searched), []
-    for row in rows[:ROWS_TOLD]:
-        i = int(np.searchsorted(begins, row, side="right")) - 1
-        campaign, own = searched[i][0], row - begins[i]
-        place = f"{own + 1}" if by_row else f"{campaign.columns['time'][own]:.10g} {campaign.units['time']}"
-        some.append(place + (f" of {campaign.name}" if len(searched) > 1 else ""))
-    how = "at" if not by_row else "in data rows" if len(rows) > 1 else "in data row"
-    return f"{how} {', '.join(some)}{'…' if len(rows) > ROWS_TOLD else ''}"
 
 
 def structured(judgement: Judgement, ranking: Ranking, column: str) -> Judgement:
@@ -381,19 +305,6 @@ def with_noise(judgement: Judgement, beyond: Sequence[Cause], trials: int) -> Ju
     if judgement.verdict == "named":
         causes = tuple(sorted(causes, key=lambda c: -c.statistic))
     return replace(judgement, causes=causes)
-
-
-def _close_rival(step: Found, told: set[str]) -> str | None:
-    """A sentence where a name that is not told was nearly as likely at first, and a later step ruled it out."""
-    statistic = step.ranking.statistic
-    rivals = {k: v for k, v in statistic.items() if k not in (step.name, "outliers") and not is_driver(k)}
-    rival = max(rivals, key=lambda k: rivals[k], default=None)
-    if rival is None or rival in told or step.name in _supersedes(rival) or rival in _supersedes(step.name):
-        return None
-    lead = statistic.get(step.name, np.inf) - rivals[rival]
-    if not 0 <= lead < -np.log(1.0 / CREDIBLE - 1.0):
-        return None
-    return f"When it was added, {step.name} led {rival} by {lead:.1f} nats only; later terms ruled {rival} out."
 
 
 def _as_set(cause: Cause, members: dict[str, float]) -> tuple[Cause, ...]:
