@@ -21,11 +21,17 @@ from scipy.special import gammaln
 
 import gyromodel as gm
 from gyromodel.averages import average
-from gyromodel.diagnosis import Cause
+from gyromodel.diagnosis import Cause, _calibrate
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores
 from gyromodel.diagnosis._epochs import epoch_interval
-from gyromodel.diagnosis._evidence import SAFE_THRESHOLD, SIZES, explained_for, log_evidence_ratio
+from gyromodel.diagnosis._evidence import (
+    SAFE_THRESHOLD,
+    SIZES,
+    explained_for,
+    log_evidence_ratio,
+    log_mean_evidence,
+)
 from gyromodel.diagnosis._forms import step_at
 from gyromodel.diagnosis._pairs import best_pair
 from gyromodel.diagnosis._ranking import rank
@@ -36,7 +42,7 @@ from gyromodel.effects.drivers import BiasStep
 from gyromodel.effects.thermal import BiasWarmup
 from gyromodel.estimate import EstimateError, fit_record
 from gyromodel.model import record_span
-from gyromodel.noise import NoiseGrid, NoiseRatios, markov_sum
+from gyromodel.noise import NoiseGrid, NoiseRatios, markov_sum, noise_grid
 from gyromodel.signals import read_signals
 from tests.truth import study
 
@@ -243,6 +249,30 @@ def test_calibration_is_kept_by_design(rng: np.random.Generator, tmp_path, monke
         alike = fit_record(record, gm.model_from_effects(["bias"]), ratios=white)
         null_scores(other, alike, 128, 1, lambda line, done: said.append(line))
         assert (len(said) > drawn) == new
+
+
+@pytest.mark.parametrize(("flicker", "walk"), [(1.0, 0.0), (0.0, 0.01)])
+def test_calibration_draws_meet_the_noise_cells_they_need(flicker: float, walk: float, tmp_path, monkeypatch) -> None:
+    """S of the same draws in all noise cells; in every other level near the campaign's own it was a nat or six more."""
+    record = read_signals(static_log(np.random.default_rng(7)))
+    ratios = NoiseRatios(jnp.asarray(flicker), jnp.asarray(walk))
+    baseline = fit_record(record, gm.model_from_effects(["bias"]), ratios=ratios)
+    grid = noise_grid(record.rows, record.interval, record_span(record))
+    scanner = Scanner(record, build_bank(record), grid)
+    points = []
+    for place in ("some", "all"):
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / place))
+        scores = null_scores(scanner, baseline, 256, 1, lambda line, done: None)
+        points.append(np.quantile(scores, [0.5, 0.9, 0.95]))
+        monkeypatch.setattr(_calibrate, "_cells_of", lambda scanner, *_: scanner.all_cells())
+    assert np.abs(points[0] - points[1]).max() < 0.45
+
+
+def test_evidence_of_many_sets_is_that_of_each(rng: np.random.Generator) -> None:
+    t = rng.chisquare(2, (300, 40))
+    t[7, :3] += [20.0, 60.0, 120.0]
+    each = [log_mean_evidence(t[:, [i]], np.full(1, 900.0), 900, 2)[0] for i in range(40)]
+    assert np.allclose(log_mean_evidence(t, np.full(40, 900.0), 900, 2), each, rtol=0, atol=1e-4)
 
 
 def test_a_fold_does_not_search_what_only_the_rows_left_out_would_tell(rng: np.random.Generator) -> None:

@@ -16,13 +16,11 @@ import pyarrow as pa
 from scipy.special import expit, logsumexp
 
 from gyromodel.batch._units import Spread, copies, spread_of
-from gyromodel.diagnosis import SAFE_THRESHOLD
+from gyromodel.diagnosis import SAFE_THRESHOLD, UNLISTED
 
 SHARES = (np.arange(50) + 0.5) / 50
 # Of the posterior, that of a name which stands alone.
 CERTAIN = 0.95
-# Nats by which a cause that no catalogue lists must do better, as in a diagnosis.
-UNLISTED = 1.0
 
 
 class PooledEffect(NamedTuple):

@@ -4,6 +4,7 @@ from gyromodel.diagnosis._added_tests import AddedTest, added_tests
 from gyromodel.diagnosis._diagnose import diagnose
 from gyromodel.diagnosis._evidence import SAFE_THRESHOLD
 from gyromodel.diagnosis._isolation import Isolability, Size, isolability
+from gyromodel.diagnosis._ranking import UNLISTED
 from gyromodel.diagnosis._result import (
     Candidate,
     Cause,
@@ -18,6 +19,7 @@ from gyromodel.diagnosis._result import (
 
 __all__ = [
     "SAFE_THRESHOLD",
+    "UNLISTED",
     "AddedTest",
     "Candidate",
     "Cause",

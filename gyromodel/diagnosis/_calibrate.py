@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from zipfile import BadZipFile
 
@@ -17,16 +17,19 @@ import numpy as np
 
 from gyromodel import __version__
 from gyromodel._cache import cache_folder
+from gyromodel.diagnosis._batch import Batch
 from gyromodel.diagnosis._drivers import RESPONSE_DRIVER
-from gyromodel.diagnosis._ranking import EXEMPT, cells_of_weight, is_driver, rank, skipped, tangents
+from gyromodel.diagnosis._evidence import SAFE_THRESHOLD, log_sum
+from gyromodel.diagnosis._ranking import EXEMPT, TIME_MARGIN, UNLISTED, is_driver, skipped, tangents
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.estimate import Estimate, filter_of
+from gyromodel.noise import from_grams, gram_by_cell
 from gyromodel.numerics.state_space import colour
 
 # Draws searched at once, more of short records, whose values stay within so many.
 LEAST_TOGETHER, MOST_TOGETHER, VALUES_TOGETHER = 64, 256, 2**18
-# Draws are searched in the noise cells within this many nats of the best on the data: each has noise of its own.
-WITHIN = 12.0
+# Draws are searched in the noise cells that hold this part of the weight of the first few.
+HELD, FIRST = 0.995, 32
 # Columns that a test sets; others (a supply voltage, a pressure) wander, in each campaign of a design otherwise.
 SET = ("rate", "temperature", "acceleration", "azimuth", "table", "magnetic", "vibration", "feedback", "campaign")
 # Parts of a record whose means are a column's course, and how far courses (in their own spread), lengths, intervals (as
@@ -34,7 +37,7 @@ SET = ("rate", "temperature", "acceleration", "azimuth", "table", "magnetic", "v
 COURSE, SAME = 32, 0.1
 
 # Counts the rules by which draws have been scored: those kept by an earlier one do not serve.
-RULE = 4
+RULE = 5
 
 _draw = jax.jit(jax.vmap(colour, in_axes=(None, 0)))
 
@@ -62,40 +65,20 @@ def null_scores(
                 return kept["scores"]
     skip = skipped(baseline.model, scanner.record.signals)
     continued = list(tangents(scanner, baseline.model, skip).values())
-    cells = [0] if scanner.stated else scanner.only_cells
-    if cells is None:
-        cells = cells_of_weight(rank(scanner, scanner.coarse_cells(), baseline, (), skip), WITHIN)
     filter = filter_of(scanner.record, baseline.ratios)
-    prior = scanner.grid.log_prior[cells][:, None]
-    walks = np.asarray(scanner.grid.ratios.walk)[cells] > 0
-    rng = np.random.default_rng(seed)
-    scores, rows = [], len(scanner.present)
+    rng, rows = np.random.default_rng(seed), len(scanner.present)
+
+    def draw(count: int) -> np.ndarray:
+        return np.asarray(_draw(filter, jax.numpy.asarray(rng.standard_normal((count, rows))))).T
+
+    cells = [0] if scanner.stated else scanner.only_cells or _cells_of(scanner, columns, draw(FIRST))
     together = min(
         max(VALUES_TOGETHER // rows, LEAST_TOGETHER), MOST_TOGETHER, -(-draws // LEAST_TOGETHER) * LEAST_TOGETHER
     )
+    scores = []
     for start in range(0, draws, together):
-        white = rng.standard_normal((together, rows))
-        drawn = np.asarray(_draw(filter, jax.numpy.asarray(white))).T
-        batches = scanner.run_many(cells, columns, drawn, {}, tangents=continued)
-        logs = np.stack([b.log_likelihood for b in batches]) + prior
-        names = sorted(set.intersection(*(set(b.evidence) for b in batches)) - skip)
-        null, each, more = np.logaddexp.reduce(logs), [], []
-        for name in names:
-            beside = logs + np.stack([b.evidence[name] for b in batches])
-            evidence = np.logaddexp.reduce(beside) - null
-            among = evidence
-            if walks.any() and name not in EXEMPT:
-                among = np.logaddexp.reduce(beside[walks]) - np.logaddexp.reduce(logs[walks])
-            each.append(evidence)
-            more.append(np.maximum(evidence - among, 0.0))
-        if {"bias_periodic", RESPONSE_DRIVER} <= set(names):
-            # Lines that any response to the motion explains better are not what a search would add (`Ranking.best`).
-            line = names.index("bias_periodic")
-            each[line] = np.where(each[names.index(RESPONSE_DRIVER)] > each[line], -np.inf, each[line])
-        drivers = np.array([is_driver(name) for name in names])
-        # Of the best name and of the best driver, as a search weighs no other.
-        tops = [np.where(kind[:, None], each, -np.inf).argmax(axis=0) for kind in (drivers, ~drivers) if kind.any()]
-        scores.append(np.max([(np.array(each) - more)[top, np.arange(together)] for top in tops], axis=0))
+        batches = scanner.run_many(cells, columns, draw(together), {}, tangents=continued)
+        scores.append(_significance(scanner, cells, batches, skip))
         say("calibrating the threshold", 0.06 + 0.18 * min(1.0, (start + together) / draws))
     found = np.concatenate(scores)[:draws]
     with suppress(OSError):
@@ -105,6 +88,50 @@ def null_scores(
         np.savez(part, course=course, scores=found)
         part.replace(folder / f"{digest}-{own}.npz")
     return found
+
+
+def _cells_of(scanner: Scanner, columns: np.ndarray, drawn: np.ndarray) -> list[int]:
+    """The noise cells that matter to draws."""
+    grid, p = scanner.grid, columns.shape[1]
+    data = np.where(scanner.present[:, None], np.column_stack([columns, drawn]), 0.0)
+    logs, grams = gram_by_cell(grid.ratios, grid.interval, grid.span, scanner.record.sampling, data)
+    weight = np.zeros(len(logs))
+    for i in range(p, data.shape[1]):
+        one = np.ix_(range(len(logs)), [*range(p), i], [*range(p), i])
+        each = from_grams(logs, grams[one], scanner.degrees_of_freedom).log_likelihood + grid.log_prior
+        weight += np.exp(each - log_sum(each)) / FIRST
+    order = np.argsort(-weight)
+    return sorted(order[: int(np.searchsorted(np.cumsum(weight[order]), HELD)) + 1].tolist())
+
+
+def _significance(scanner: Scanner, cells: Sequence[int], batches: Sequence[Batch], skip: set[str]) -> np.ndarray:
+    """`Ranking.significance` of many data sets of one baseline."""
+    grid = scanner.grid
+    logs = np.stack([b.log_likelihood for b in batches]) + grid.log_prior[cells][:, None]
+    walks = np.asarray(grid.ratios.walk)[cells] > 0
+    slow_noise = (walks | (np.asarray(grid.ratios.flicker)[cells] > 0))[logs.argmax(axis=0)]
+    names = sorted(set.intersection(*(set(b.evidence) for b in batches)) - skip)
+    null, each, more = np.logaddexp.reduce(logs), [], []
+    for name in names:
+        beside = logs + np.stack([b.evidence[name] for b in batches])
+        evidence = np.logaddexp.reduce(beside) - null
+        needed = np.full(len(evidence), UNLISTED * is_driver(name))
+        if walks.any() and name not in EXEMPT:
+            among = np.logaddexp.reduce(beside[walks]) - np.logaddexp.reduce(logs[walks])
+            needed += np.maximum(evidence - among, 0.0)
+        if name == "smooth(time)" and scanner.runs < 2:
+            needed = np.where(slow_noise, TIME_MARGIN - SAFE_THRESHOLD, needed)
+        each.append(evidence)
+        more.append(needed)
+    if {"bias_periodic", RESPONSE_DRIVER} <= set(names):
+        # Lines that any response to the motion explains better are not what a search would add (`Ranking.best`).
+        line = names.index("bias_periodic")
+        each[line] = np.where(each[names.index(RESPONSE_DRIVER)] > each[line], -np.inf, each[line])
+    drivers = np.array([is_driver(name) for name in names])
+    # Of the best name and of the best driver, as a search weighs no other.
+    tops = [np.where(kind[:, None], each, -np.inf).argmax(axis=0) for kind in (drivers, ~drivers) if kind.any()]
+    left = np.array(each) - more
+    return np.max([left[top, np.arange(left.shape[1])] for top in tops], axis=0)
 
 
 def _design(scanner: Scanner, baseline: Estimate, draws: int, seed: int) -> tuple[str, np.ndarray]:

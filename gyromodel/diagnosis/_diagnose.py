@@ -66,7 +66,7 @@ class _Session:
                 path, estimates = selection.path[:first], selection.estimates[: first + 1]
                 found, ranking = tuple(standing(path)), step.ranking
                 # What was cut may have stood for a driver that was ahead of it.
-                driver = significant_driver(ranking, self.threshold, self.scanner.runs)
+                driver = significant_driver(ranking, self.threshold)
                 if driver and ranking.statistic[driver] < ranking.statistic[step.name] + EXCHANGE:
                     driver = None
                 cut = Selection(

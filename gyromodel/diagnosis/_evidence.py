@@ -14,6 +14,9 @@ import numpy as np
 SIZES = np.array([1e1, 1e2, 1e3, 1e4])
 # ln of the evidence ratio that noise alone exceeds less than once in a hundred campaigns; see benchmarks/threshold.py.
 SAFE_THRESHOLD = 4.0
+# Data sets whose evidence is worked out at once: as many as stay in the processor's cache. Of more than these B is
+# read from so many nodes, whose error is below 1e-4 while ln B stays this small.
+SETS_TOGETHER, NODES, SMALL = 8, 4096, 100.0
 
 
 def log_evidence_ratio(t: np.ndarray, rss: np.ndarray | float, nu: int, q: np.ndarray | int) -> np.ndarray:
@@ -31,6 +34,25 @@ def log_evidence_at_sizes(
     half = 0.5 * np.asarray(q, float)
     # Plain log and exp, which processors vectorise; 1 − part loses nothing that matters times ν.
     return [-0.5 * nu * np.log(1.0 - size / (1.0 + size) * part) - half * np.log1p(size) for size in SIZES]
+
+
+def log_mean_evidence(t: np.ndarray, rss: np.ndarray, nu: int, q: int) -> np.ndarray:
+    """ln of the mean B over where q columns may stand: one row a place, one column a data set."""
+    part, found = np.clip(t / rss, 0.0, 1.0), np.zeros(t.shape[1])
+    most = max(float(part.max()), 1e-12)
+    nodes = np.linspace(0.0, most, NODES + 1)
+    few = t.shape[1] <= SETS_TOGETHER or log_evidence_ratio(nodes[-1:], 1.0, nu, q)[0] > SMALL
+    b = np.zeros(0) if few else np.exp(log_evidence_ratio(nodes, 1.0, nu, q))
+    rise = np.diff(b, append=b[-1:])
+    for i in range(0, t.shape[1], SETS_TOGETHER):
+        here = slice(i, i + SETS_TOGETHER)
+        if few:
+            found[here] = log_mean(log_evidence_ratio(part[:, here], 1.0, nu, q))
+            continue
+        x = part[:, here] * (NODES / most)
+        k = x.astype(int)
+        found[here] = np.log(np.mean(b[k] + (x - k) * rise[k], axis=0))
+    return found
 
 
 def explained_for(log_ratio: float, nu: int, q: int) -> float:

@@ -12,7 +12,7 @@ from gyromodel._checks import thermometers
 from gyromodel.diagnosis._bank import Bank
 from gyromodel.diagnosis._batch import CellResult
 from gyromodel.diagnosis._drivers import RESPONSE_DRIVER
-from gyromodel.diagnosis._evidence import SIZES, log_evidence_at_sizes, log_mean, log_sum
+from gyromodel.diagnosis._evidence import SAFE_THRESHOLD, SIZES, log_evidence_at_sizes, log_mean, log_sum
 from gyromodel.diagnosis._lines import lines_of
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._tangents import Tangent
@@ -33,6 +33,10 @@ MARKOV_PRIOR, MARKOV_NAMED = np.log(0.2), np.log(0.05)
 SLOW_IN_TIME = ("bias_drift", "bias_warmup", "bias_step")
 # What has its own rule for a random walk, or nothing to do with one.
 EXEMPT = (*SLOW_IN_TIME, "outliers")
+# A function of time alone must beat a random walk by this much in one run: no real slow noise is exactly a random walk.
+TIME_MARGIN = 15.0
+# Nats by which a cause that no catalogue lists must do better: it is rarer than one that does.
+UNLISTED = 1.0
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,7 @@ class Ranking:
     baseline_columns: np.ndarray = field(repr=False)
     residual: np.ndarray = field(repr=False)
     samples: int
+    runs: int
     tangents: dict[str, Tangent] = field(default_factory=dict, repr=False)
     fitted: frozenset[str] = frozenset()
 
@@ -70,16 +75,19 @@ class Ranking:
 
     @property
     def significance(self) -> float:
-        """S of what a search would add, or of the best driver, less what that needs more."""
+        """S of what a search would add, or of the best driver, less what that needs more (`null_scores` draws it)."""
         tops = [top for drivers in (False, True) if (top := self.best(drivers=drivers)[0])]
         return max((self.statistic[k] - self.more_needed(k) for k in tops), default=-np.inf)
 
     def more_needed(self, name: str) -> float:
         """Nats that a candidate needs more: what it would lose were it known that the noise has a random walk.
 
-        A walk too weak to show still imitates what changes slowly.
+        A walk too weak to show still imitates what changes slowly. A driver needs `UNLISTED` besides; one of time in a
+        single run, beside slow noise, what no walk makes.
         """
-        return self._lost_to_a_walk(name) if self.needs_a_walk(name) else 0.0
+        if name == "smooth(time)" and self.runs < 2 and self.slow_noise:
+            return TIME_MARGIN - SAFE_THRESHOLD
+        return UNLISTED * is_driver(name) + (self._lost_to_a_walk(name) if self.needs_a_walk(name) else 0.0)
 
     def _lost_to_a_walk(self, name: str) -> float:
         """Nats that a candidate would lose were it known that the noise has a random walk."""
@@ -226,8 +234,9 @@ def rank(
     each = [scanner.grid.ratios.take(g) for g in cells]
     slow = {g: max(float(r.walk), float(r.flicker), float(r.markov)) > 0 for g, r in zip(cells, each, strict=True)}
     walks = {g: float(r.walk) > 0 for g, r in zip(cells, each, strict=True)}
+    samples = scanner.degrees_of_freedom
     return Ranking(
-        statistic, posterior, results, prior, slow, walks, columns, residual, scanner.degrees_of_freedom, continued
+        statistic, posterior, results, prior, slow, walks, columns, residual, samples, scanner.runs, continued
     )
 
 

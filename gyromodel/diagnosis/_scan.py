@@ -20,7 +20,7 @@ from threadpoolctl import ThreadpoolController
 from gyromodel.diagnosis._bank import Bank
 from gyromodel.diagnosis._batch import Batch, CellResult
 from gyromodel.diagnosis._cells import Cell, Cells
-from gyromodel.diagnosis._evidence import log_evidence_ratio, log_mean, log_mean_of_parts
+from gyromodel.diagnosis._evidence import log_evidence_ratio, log_mean_evidence, log_mean_of_parts
 from gyromodel.diagnosis._lines import PEAK_WIDTH, PEAKS, Line, line_grid
 from gyromodel.diagnosis._points import MOST_APART, MOST_POINTS, SUSPECT, levels, suspects, test_points
 from gyromodel.diagnosis._tangents import VANISHED, Tangent, add_tangents
@@ -39,8 +39,6 @@ PEAK_SLACK = 1.5
 # Further gross errors that are given up with the greatest: evidence of each alone (nats), the search over rows paid
 # for, and rows to the next, as errors side by side share theirs.
 ERROR_MARGIN, ERROR_DISTANCE = 8.0, 3
-# Data sets whose evidence is worked out at once: as many as stay in the processor's cache.
-SETS_TOGETHER = 8
 
 
 @cache
@@ -417,12 +415,9 @@ class Scanner:
     ) -> None:
         if not len(where):
             return
-        evidence, top = np.zeros(t.shape[1]), np.argmax(np.minimum(t, batch.rss), axis=0)
-        for i in range(0, t.shape[1], SETS_TOGETHER):
-            here = slice(i, i + SETS_TOGETHER)
-            evidence[here] = log_mean(log_evidence_ratio(t[:, here], batch.rss[here], nu, q))
+        top = np.argmax(np.minimum(t, batch.rss), axis=0)
         best = np.minimum(t[top, np.arange(len(top))], batch.rss)
-        batch.evidence[name] = evidence
+        batch.evidence[name] = log_mean_evidence(t, batch.rss, nu, q)
         batch.best[name] = (list(where[top]), best, np.full(len(top), float(q)))
         batch.energy[name] = energy
 

@@ -24,10 +24,6 @@ Progress = Callable[[str, float], None] | None
 MAXIMUM_ROUNDS = 12
 # More steps than this are a function of time that nobody explains by naming each.
 MAXIMUM_STEPS = 3
-# A function of time alone must beat a random walk by this much in one run: no real slow noise is exactly a random walk.
-TIME_MARGIN = 15.0
-# Nats by which a cause that no catalogue lists must do better: it is rarer than one that does.
-UNLISTED = 1.0
 
 
 @dataclass(frozen=True)
@@ -126,7 +122,7 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
     there = {name: ranking.statistic[name] for name in lost if name in ranking.statistic}
     there = {name: score for name, score in there.items() if _significant(steps, ranking, name, score)}
     remains = remains or max(there, key=lambda name: there[name], default="")
-    driver = significant_driver(ranking, threshold, scanner.runs)
+    driver = significant_driver(ranking, threshold)
     selection = Selection(
         estimates[-1], tuple(found), tuple(path), ranking, tuple(estimates), driver, left_out, remains, small
     )
@@ -145,7 +141,7 @@ def steadied(steps: Steps, selection: Selection) -> Selection:
         found=tuple(found),
         last=ranking,
         estimates=(*selection.estimates[:-1], estimate),
-        driver=significant_driver(ranking, steps.threshold, steps.scanner.runs),
+        driver=significant_driver(ranking, steps.threshold),
         left_out={},
         remains="bias_periodic",
         unresolved=said,
@@ -195,17 +191,13 @@ def _together(steps: Steps, path: list[Found], estimate: Estimate, ranking: Rank
         return []
     other = steps.step([*path, one], first, ranking, pair[1])
     both = steps.fit(standing([*path, one, other]))
-    return [] if both is None else [(one, first), (other, both)]
+    return [] if both is None or not steps.keeps(first, other, both) else [(one, first), (other, both)]
 
 
-def significant_driver(ranking: Ranking, threshold: float, runs: int) -> str | None:
-    """The leading smooth driver, if it is significant; for one of time beside slow noise, over what a walk makes."""
+def significant_driver(ranking: Ranking, threshold: float) -> str | None:
+    """The leading smooth driver, if it is significant."""
     driver, score = ranking.best(drivers=True)
-    if driver is None:
-        return None
-    like_a_walk = driver == "smooth(time)" and runs < 2 and ranking.slow_noise
-    least = max(threshold, TIME_MARGIN) if like_a_walk else threshold + UNLISTED + ranking.more_needed(driver)
-    return driver if score >= least else None
+    return driver if driver and score >= threshold + ranking.more_needed(driver) else None
 
 
 def _before(i: int, path: list[Found], estimates: list[Estimate]) -> Selection:

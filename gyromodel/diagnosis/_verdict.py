@@ -15,11 +15,11 @@ from gyromodel.diagnosis._causes import cause_of
 from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._exchange import uncontested
 from gyromodel.diagnosis._points import levels
-from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, is_driver, is_noise, supersedes
+from gyromodel.diagnosis._ranking import SLOW_IN_TIME, TIME_MARGIN, Ranking, is_driver, is_noise, supersedes
 from gyromodel.diagnosis._result import CREDIBLE, VAGUE, Cause, ParameterValue, Verdict
 from gyromodel.diagnosis._said import told, told_of_cause, told_of_rest
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._search import TIME_MARGIN, Selection
+from gyromodel.diagnosis._search import Selection
 from gyromodel.diagnosis._shapes import remaining
 from gyromodel.diagnosis._steps import Found, Steps
 from gyromodel.diagnosis._variance import quantum

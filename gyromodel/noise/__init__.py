@@ -4,7 +4,7 @@ a record.
 
 from gyromodel.noise._deviation import Deviation, Estimator, deviation, with_gaps
 from gyromodel.noise._identify import IdentifiedNoise, Line, identify_noise
-from gyromodel.noise._likelihood import CellFit, from_grams, restricted_likelihood
+from gyromodel.noise._likelihood import CellFit, from_grams, gram_by_cell, restricted_likelihood
 from gyromodel.noise._model import (
     MARKOV_TIME,
     NOISE_UNITS,
@@ -35,6 +35,7 @@ __all__ = [
     "coefficients",
     "deviation",
     "from_grams",
+    "gram_by_cell",
     "identify_noise",
     "markov_cells",
     "markov_sum",
