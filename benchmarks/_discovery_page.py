@@ -60,7 +60,7 @@ def write_page(output: Path, whole: list[Kept]) -> None:
         _check("7", "mean size of the 95 % set, isolable, 3×", f"≤ {levels.SET_SIZE}", three, at_three, small),
         _spent(whole[-1].seconds),
         *(_leak(sized[s], s) for s in (1.0, 3.0)),
-        _bound(sized[1.0]),
+        *_beside_names(sized[1.0]),
         *control_checks,
         *mutant_checks,
     ]
@@ -217,11 +217,13 @@ def _leak(records: list[study.Record], size: float) -> str:
                   measured, len(records), bool(fair))  # fmt: skip
 
 
-def _bound(records: list[study.Record]) -> str:
-    """Row 5 of an oracle that knows noise and size, and needs as much evidence and as large a share as the engine."""
-    named, count = levels.oracle_names(records)
-    measure = "what bounds it: named by the oracle as firmly, 1×"
-    return f"| 5 | {measure} | – | – | {100 * named / max(count, 1):.1f} % | {count} | – | |"
+def _beside_names(records: list[study.Record]) -> list[str]:
+    """Row 5 of an oracle that knows noise and size, and is as sure as the engine; and with rivals beside the name."""
+    counted = {
+        "what bounds it: named by the oracle as firmly, 1×": levels.oracle_names(records),
+        "detected, and the right name first, alone or in a set, 1×": levels.told_first(records),
+    }
+    return [f"| 5 | {k} | – | – | {100 * n / max(m, 1):.1f} % | {m} | – | |" for k, (n, m) in counted.items()]
 
 
 def _mutants(parts: dict[str, list[study.Record]]) -> tuple[list[str], list[str]]:

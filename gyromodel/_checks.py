@@ -74,7 +74,7 @@ def check_unit(name: str, unit: str | None) -> str:
     known = _known(name)
     if unit is None:
         accepted = f"{known[0]}: {listed(known[1])}" if known else unit_system.ACCEPTED
-        example = known[1][0] if known else "unit"
+        example = known[1][0].strip("[]") if known else "unit"
         raise CampaignError(f"column '{name}' has no unit: write '{name} [{example}]' (accepted: {accepted})")
     try:
         unit = unit_system.tidy(unit)

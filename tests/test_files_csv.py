@@ -79,6 +79,7 @@ def test_metadata_values(tmp_path: Path, text: str, value: Any):
             LINES.replace("rate [deg/s]", "rate"),
             r"column 'rate' has no unit: write 'rate \[deg/s\]' .accepted: an angular",
         ),
+        (LINES.replace("rate [deg/s]", "run"), r"column 'run' has no unit: write 'run \[\]' .accepted: a plain number"),
         (LINES.replace("rate [deg/s]", "rate [furlong]"), r"column 'rate': unknown unit 'furlong' \(accepted: s, ms"),
         (LINES.replace("rate [deg/s]", "[deg/s]"), "column 2 has no name in the header"),
         (LINES.replace("rate [deg/s]", "output [V]"), "two columns are named 'output': column 2 and 3"),

@@ -117,6 +117,39 @@ def test_a_late_thermometer_under_a_curved_bias_is_named_with_its_delay():
     assert "temperature_lag" not in found.not_testable
 
 
+def with_late_coil(rng: np.random.Generator, tau: float, curved: bool) -> gm.Campaign:
+    """A static cycle with a bias over the temperature of a coil that is τ behind the case, where the thermometer is."""
+    design = DESIGNS["static_cycle"](rng)
+    time, case = design.thermal
+    coil = np.interp(design.true["time"], time, late(time, case, tau))
+    coil -= np.quantile(coil, 0.25)
+    return campaign_of(design, (coil**2 / 20 if curved else coil) + rng.standard_normal(len(coil)))
+
+
+@pytest.mark.parametrize("curved", [True, False])
+def test_a_coil_far_behind_the_thermometer_is_named_with_its_delay(curved: bool):
+    """Its delay is no small part of the cycle, so that b(T) + b'(T) τ dT/dt is not what it makes."""
+    rng = np.random.default_rng(EXAMPLE)
+    tau = rng.uniform(300.0, 500.0)
+    known = "bias_temperature_curve" if curved else "bias_temperature"
+    found = gm.diagnose(with_late_coil(rng, tau, curved), gm.model_from_effects(["bias", known]), hold_out=False)
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["temperature_lag"])
+    delay = next(p for p in found.causes[0].parameters if p.name == "time_constant")
+    assert delay.value == pytest.approx(tau, abs=4 * delay.std)
+    effect = next(e for e in found.extended.model.effects if e.label == "temperature_lag")
+    assert (effect.late, effect.remembers) == ("coil", True)
+
+
+def test_a_late_coil_is_written_and_read(tmp_path):
+    effect = TemperatureLag(time_constant=jnp.asarray(300.0), coefficients=jnp.asarray([2.0]), late="coil")
+    write_model(GyroModel((effect,)), tmp_path / "model.yaml")
+    assert read_model(tmp_path / "model.yaml").effects[0].late == "coil"
+    text = (tmp_path / "model.yaml").read_text().replace("coil", "chamber")
+    (tmp_path / "other.yaml").write_text(text)
+    with pytest.raises(ModelError, match="late takes thermometer or coil"):
+        read_model(tmp_path / "other.yaml")
+
+
 def test_a_late_thermometer_under_a_straight_bias_is_the_shupe_effect():
     campaign, _ = lagging(np.random.default_rng(EXAMPLE), "line")
     found = gm.diagnose(campaign, gm.model_from_effects(["bias", "bias_temperature"]), hold_out=False)

@@ -203,11 +203,10 @@ def _grown(scanner: Scanner, estimate: Estimate, tangent: Tangent, g: int, pulse
     """An effect that continues others, at the amplitude that fits best beside them."""
     effect, column = tangent.effect, tangent.column[:, None] * float(estimate.model.gain())
     best = _coefficients(scanner, estimate.model, column, g, pulses)
-    name = [k for k, declared in effect.declared().items() if not declared.linear][-1]
     amplitude = jnp.clip(best[0], -effect.reach, effect.reach)
     while True:
         try:
-            return replace(effect, **{name: amplitude})
+            return effect.grown_by(amplitude)
         except ValueError:  # beyond what the effect can be, which it is at none
             amplitude = 0.5 * amplitude
 

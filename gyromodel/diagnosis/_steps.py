@@ -19,6 +19,8 @@ NoisePath = Sequence[NoiseRatios]
 
 # Part of what it explains that an effect may lose for a shape that lies between those searched.
 BETWEEN = 0.05
+# Evidence (nats) from which on what continues an effect is fitted to be ranked.
+BY_FIT = 20.0
 # Times that the uncertainty of a shape may grow by that of all others.
 ENTANGLED = 300.0
 # Part of its evidence (nats) by which a fit must gain with a candidate: what was searched may be no form it can have.
@@ -110,13 +112,14 @@ class Steps:
         """
         ranking = rank_where_it_matters(self._seen(estimate), estimate, rows_of(found))
         (name, score), driver = ranking.best(drivers=False), ranking.best(drivers=True)[1]
-        if BETWEEN * score < EXCHANGE or not name or not (name in ranking.tangents or self.scanner.bank.forms(name)):
+        # What continues an effect is ranked by its slope alone, which may lose most of it.
+        grown = {k for k in ranking.tangents if ranking.statistic.get(k, -np.inf) > max(self.threshold, 0.25 * score)}
+        grown = grown if self.scanner.record.domain == "gyro" and max(score, driver) > BY_FIT else set()
+        between = BETWEEN * score >= EXCHANGE and name and (name in ranking.tangents or self.scanner.bank.forms(name))
+        if not name or not (grown or between):
             return ranking
         least = (1.0 - BETWEEN) * ranking.explained(name)
-        near = {k for k in ranking.statistic if self._has_shape(k) and ranking.explained(k) >= least}
-        # What continues an effect is ranked by its slope alone, which may lose most of it.
-        if self.scanner.record.domain == "gyro":
-            near |= {k for k in ranking.tangents if ranking.statistic.get(k, -np.inf) > 0.5 * score}
+        near = grown | {k for k in ranking.statistic if self._has_shape(k) and ranking.explained(k) >= least}
         if not near - {name} and (name not in near or driver < score):
             return ranking
         each = [self.step(found, estimate, ranking, k) for k in {name, *near}]
@@ -125,14 +128,15 @@ class Steps:
         fits = {step.name: self.fit(standing([*found, step, given_up])) for step in each}
         bank = self.scanner.bank
         price = {k: np.log(max(bank.structures(k), 1)) + bank.price(k) for k in fits}
-        quality = {k: _quality(fit) - price[k] for k, fit in fits.items() if fit is not None}
+        held = {k: fit for k, fit in fits.items() if fit and not any(e.beyond_reach for e in fit.model.effects)}
+        quality = {k: _quality(fit) - price[k] for k, fit in held.items()}
         before = self.fit([*found, given_up])
         if name not in quality or before is None:
             return ranking
-        if driver < score and max(quality.values()) < quality[name] + EXCHANGE:
-            return ranking
         own = max(score, quality[name] - _quality(before))
         told = {k: own + v - quality[name] for k, v in quality.items()}
+        if driver < score and all(v < ranking.statistic[k] + EXCHANGE for k, v in told.items()):
+            return ranking
         return replace(ranking, statistic=ranking.statistic | told, fitted=frozenset(told))
 
     def fits_better(self, found: Sequence[Found], other: Sequence[Found]) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Literal, Self
 
 import equinox as eqx
@@ -144,6 +144,18 @@ class Effect(eqx.Module):
         That parameter is then its amplitude. None where the model has nothing to grow from.
         """
         return None
+
+    def grown_by(self, amplitude: Float[Array, ""]) -> Self:
+        """This effect, which continues others, at an amplitude; ValueError beyond what it can be."""
+        return replace(self, **{self._amplitude(): amplitude})
+
+    @property
+    def beyond_reach(self) -> bool:
+        """Whether this effect, if it continues others, has a larger amplitude than any that is believed."""
+        return bool(np.isfinite(self.reach) and abs(getattr(self, self._amplitude())) > self.reach)
+
+    def _amplitude(self) -> str:
+        return [k for k, declared in self.declared().items() if not declared.linear][-1]
 
     @classmethod
     def declared(cls) -> dict[str, Parameter]:

@@ -189,8 +189,9 @@ class BiasTemperatureProduct(OverTemperature, BiasTemperatureRate):
 class TemperatureLag(OverTemperature):
     """E += b(T + τ dT/dt), b(u) = Σ a_i ((u − T0)/10 °C)^i + Σ h_j max(u − T_j, 0): the thermometer is late by τ.
 
-    It contains the bias over temperature, b, and equals it for τ = 0. Where b is a line of slope a it is
-    bias_temperature_rate with the coefficient a·τ. Below zero τ says that the coil is later than the thermometer.
+    Where `late` says that it is the coil, E += b(U), τ dU/dt + U = T: U follows the thermometer through a lag. It
+    contains the bias over temperature, b, and equals it for τ = 0. Where b is a line of slope a it is
+    bias_temperature_rate with the coefficient a·τ; of a coil with −a·τ, behind the lag τ.
     """
 
     id = "temperature_lag"
@@ -205,15 +206,35 @@ class TemperatureLag(OverTemperature):
     coefficients: Float[Array, " order"] = parameter("deg/h", 1.0, "power i: bias per (10 °C)^i", default=(0.0,))
     hinges: Float[Array, " hinge"] = parameter("deg/h/degC", 1.0, "change of slope at each breakpoint", default=())
     breakpoints: Float[Array, " hinge"] = parameter("degC", 10.0, "where the slope changes", linear=False, default=())
-    time_constant: Float[Array, ""] = parameter("s", 100.0, "how late the thermometer is", linear=False)
+    time_constant: Float[Array, ""] = parameter("s", 100.0, "how late it is", linear=False)
+    late: str = eqx.field(static=True, default="thermometer", kw_only=True)
 
     def __check_init__(self) -> None:
         check_curve(self.coefficients, self.hinges, self.breakpoints)
+        if self.late not in ("thermometer", "coil"):
+            raise ValueError("late takes thermometer or coil")
+
+    @property
+    def remembers(self) -> bool:
+        """Where the coil is late."""
+        return self.late == "coil"
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
-        """Those of the curve, at the temperature that the thermometer will show."""
-        ahead = signals["temperature"] + self.time_constant * signals["temperature_rate"]
-        return curve_columns(ahead, self.reference, self.coefficients.shape[0], self.breakpoints)
+        """Those of the curve, at the temperature that the thermometer will show, or that the coil has."""
+        change, lag = signals["temperature_rate"], self.time_constant
+        if self.remembers:
+            change, lag = rate_behind(signals["time"], signals["temperature"], change, lag), -lag
+        coil = signals["temperature"] + lag * change
+        return curve_columns(coil, self.reference, self.coefficients.shape[0], self.breakpoints)
+
+    def unknown(self, signals: Signals) -> Bool[Array, " sample"]:
+        """The first time constants of a coil's lag."""
+        return remembered(signals["time"], self.time_constant) if self.remembers else super().unknown(signals)
+
+    def grown_by(self, amplitude: Float[Array, ""]) -> Self:
+        """A delay below zero is the coil's."""
+        late = "coil" if amplitude < 0 else "thermometer"
+        return dataclasses.replace(self, time_constant=jnp.abs(amplitude), late=late)
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:

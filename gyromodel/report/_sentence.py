@@ -114,10 +114,10 @@ def _lacks(causes: Sequence[Cause]) -> str:
 
 
 def _with_size(cause: Cause) -> str:
-    """The cause with its size; of many parameters with its one coefficient, or, as a curve has several, without."""
+    """The cause with its size; of many parameters with one coefficient or delay, if there is one."""
     values = [p for p in cause.parameters if math.isfinite(p.value) and p.std != 0.0]
     if any("[" in p.name for p in values):
-        values = [p for p in values if p.name == "coefficient"]
+        values = [p for p in values if p.name in ("coefficient", "time_constant")]
     if len(values) == 1:
         return f"{phrase(cause.effect)} of {with_uncertainty(values[0].value, values[0].std, values[0].unit)}"
     sizes = [f"{spoken(p.name)} {with_uncertainty(p.value, p.std, p.unit)}" for p in values]

@@ -24,7 +24,7 @@ PHRASES = {
     "bias_temperature_curve": "a bias that curves with temperature",
     "bias_temperature_rate": "a temperature-rate bias",
     "bias_temperature_product": "a temperature-rate bias that changes with temperature",
-    "temperature_lag": "a thermometer that is late",
+    "temperature_lag": "a delay between thermometer and coil",
     "thermometer_error": "an error of the thermistor's calibration",
     "bias_thermal_hysteresis": "a thermal hysteresis of the bias",
     "bias_temperature_gradient": "a bias proportional to a temperature difference",

@@ -137,6 +137,12 @@ def oracle_names(records: list[Record]) -> tuple[int, int]:
     return sum(r.oracle_firm and oracle_right(r) for r in alone), len(alone)
 
 
+def told_first(records: list[Record]) -> tuple[int, int]:
+    """Row 5 with rivals beside: campaigns where something is told of and the right name comes first; of how many."""
+    alone = [r.score for r in _alone(records) if r.score]
+    return sum(s.detected and s.first_right for s in alone), len(alone)
+
+
 def surpassed(records: list[Record]) -> tuple[int, int]:
     """Campaigns where only the engine's first name was right, and those where only the oracle's was."""
     pairs = [(r.score.first_right, oracle_right(r)) for r in _contested(records) if r.score]

@@ -23,6 +23,7 @@ def _patches(name: str) -> dict[str, Any]:
     if not name:
         return {}
     from gyromodel.diagnosis import _diagnose, _scan
+    from gyromodel.diagnosis._evidence import log_evidence_ratio
     from gyromodel.estimate import fit_record
 
     run_many, grid = _scan.Scanner.run_many, _diagnose.noise_grid
@@ -52,7 +53,7 @@ def _patches(name: str) -> dict[str, Any]:
         "no_projection": {"_scan.Scanner.run_many": nothing_projected},
         "no_look_elsewhere": {
             "_scan.log_mean_of_parts": best_of_parts,
-            "_scan.log_mean": lambda values: values.max(axis=0),
+            "_scan.log_mean_evidence": lambda t, *of: log_evidence_ratio(t.max(axis=0), *of),
         },
         "forced": forced,
         "forced_no_nesting": forced | {"_diagnose._gain": refitted},
