@@ -36,7 +36,8 @@ def thermal_rate_model(parameters: int) -> Any:
     """Spline scale factor, bias a quartic of the lagged temperature, warm-up; with 40 also curves with hinges."""
     from gyromodel.effects.drivers import Bias
     from gyromodel.effects.scale import ScaleFactor, ScaleSpline, ScaleTemperatureCurve
-    from gyromodel.effects.thermal import BiasTemperatureCurve, BiasWarmup, TemperatureLag
+    from gyromodel.effects.thermal import BiasTemperatureCurve, BiasWarmup
+    from gyromodel.effects.thermometer import TemperatureLag
     from gyromodel.model import GyroModel
 
     hinges = {n: {"hinges": np.zeros(n), "breakpoints": np.linspace(0.0, 30.0, n)} for n in (11, 14)}

@@ -268,6 +268,18 @@ def test_calibration_draws_meet_the_noise_cells_they_need(flicker: float, walk: 
     assert np.abs(points[0] - points[1]).max() < 0.45
 
 
+@pytest.mark.parametrize(("draws", "share"), [(200, 0.866), (500, 0.95), (2000, 0.95)])
+def test_a_threshold_of_draws_is_beyond_the_99_percent_point(
+    draws: int, share: float, rng: np.random.Generator
+) -> None:
+    """In 95 % of calibrations or more; the largest of 200 draws is in 87 %."""
+    beyond = sum(_calibrate.threshold_of(rng.random(draws)) > 0.99 for _ in range(400))
+    assert beyond >= stats.binom.ppf(1e-6, 400, share)
+    # And no farther than the draws ask for: the largest one would be beyond 99.9 % of 2000 in 86 %.
+    far = sum(_calibrate.threshold_of(rng.random(2000)) > 0.999 for _ in range(400))
+    assert far <= stats.binom.ppf(1 - 1e-6, 400, 0.01)
+
+
 def test_evidence_of_many_sets_is_that_of_each(rng: np.random.Generator) -> None:
     t = rng.chisquare(2, (300, 40))
     t[7, :3] += [20.0, 60.0, 120.0]

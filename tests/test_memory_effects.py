@@ -14,7 +14,8 @@ import gyromodel as gm
 from gyromodel.compensation import compensate
 from gyromodel.diagnosis._variance import steps_of_output, stretch_still
 from gyromodel.effects.memory import BiasThermalHysteresis
-from gyromodel.effects.thermal import BiasTemperatureProduct, BiasTemperatureRate, TemperatureLag
+from gyromodel.effects.thermal import BiasTemperatureProduct, BiasTemperatureRate
+from gyromodel.effects.thermometer import TemperatureLag
 from gyromodel.estimate import Calibration
 from gyromodel.model import GyroModel, ModelError, make_effect
 from gyromodel.model_files import read_model, write_model
@@ -138,6 +139,17 @@ def test_a_coil_far_behind_the_thermometer_is_named_with_its_delay(curved: bool)
     assert delay.value == pytest.approx(tau, abs=4 * delay.std)
     effect = next(e for e in found.extended.model.effects if e.label == "temperature_lag")
     assert (effect.late, effect.remembers) == ("coil", True)
+
+
+def test_a_late_coil_beside_stated_noise_leaves_no_noise_lacking():
+    """Its part that the slope at no delay does not hold looks like a random walk, which is found first."""
+    campaign = with_late_coil(np.random.default_rng(EXAMPLE), 350.0, curved=True)
+    step = float(np.median(np.diff(campaign.si("time"))))
+    noise = {"noise_white": jnp.asarray(np.deg2rad(1.0 / 3600.0) * np.sqrt(step))}
+    model = gm.model_from_effects(["bias", "bias_temperature_curve"])
+    found = gm.diagnose(campaign, GyroModel(model.effects, noise), hold_out=False)
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["temperature_lag"])
+    assert "Of thermometer and coil the coil is late." in found.findings
 
 
 def test_a_late_coil_is_written_and_read(tmp_path):

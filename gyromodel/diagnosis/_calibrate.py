@@ -14,6 +14,7 @@ from zipfile import BadZipFile
 
 import jax
 import numpy as np
+from scipy import stats
 
 from gyromodel import __version__
 from gyromodel._cache import cache_folder
@@ -90,6 +91,12 @@ def null_scores(
     return found
 
 
+def threshold_of(scores: np.ndarray) -> float:
+    """The least draw that is beyond the 99 % point with 95 % confidence; of few, the largest."""
+    beyond = int(stats.binom.ppf(0.95, len(scores), 0.99))
+    return float(np.sort(scores)[min(beyond, len(scores) - 1)])
+
+
 def _cells_of(scanner: Scanner, columns: np.ndarray, drawn: np.ndarray) -> list[int]:
     """The noise cells that matter to draws."""
     grid, p = scanner.grid, columns.shape[1]
@@ -143,7 +150,7 @@ def _design(scanner: Scanner, baseline: Estimate, draws: int, seed: int) -> tupl
     columns = []
     for name in sorted(n for n in record.signals if n.startswith(SET)):
         values = np.asarray(record.signals[name])[: record.rows]
-        means = np.array([part.mean() for part in np.array_split(values, COURSE)])
+        means = np.array([part.mean() for part in np.array_split(values, min(COURSE, record.rows))])
         columns.append((means - values.mean()) / max(values.std(), 1e-300))
     sizes = np.log([record.rows, scanner.present.sum(), scanner.grid.interval, scanner.grid.span])
     noise = np.log10(np.maximum([float(r) for r in baseline.ratios], 1e-12)) / 2.5

@@ -12,7 +12,7 @@ import numpy as np
 from gyromodel._checks import CampaignError, listed
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._bank import build_bank
-from gyromodel.diagnosis._calibrate import null_scores
+from gyromodel.diagnosis._calibrate import null_scores, threshold_of
 from gyromodel.diagnosis._data import Data, read
 from gyromodel.diagnosis._evidence import SAFE_THRESHOLD
 from gyromodel.diagnosis._gain import ladder_error, nested_gain, no_gain, not_measured
@@ -127,7 +127,7 @@ def diagnose(
     nulls = np.zeros(0)
     if calibrate:
         nulls = null_scores(session.scanner, baseline, calibrate, seed, say)
-        session.threshold = max(float(np.quantile(nulls, 0.99)), 0.0)
+        session.threshold = max(threshold_of(nulls), 0.0)
     selection = session.run(baseline, say)
     beyond: list[Cause] = []
     grows, following = growing_noise(record, selection.estimate), None

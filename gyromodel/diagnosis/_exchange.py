@@ -82,12 +82,14 @@ def _least(steps: Steps, ranking: Ranking, name: str) -> float:
 def _chosen_again(
     steps: Steps, found: list[Found], estimate: Estimate
 ) -> tuple[list[Found], Estimate, dict[int, Ranking]]:
-    """One pass: each addition exchanged for a better one given all the others."""
+    """One pass: each addition exchanged for a better one given all the others, but for noise, which only may go."""
     rankings: dict[int, Ranking] = {}
     for i in range(len(found) if len(found) > 1 else 0):
-        if found[i].effect is None or uncontested(found[i]) or (rest := steps.all_but(found, i)) is None:
+        if not found[i].weighed or uncontested(found[i]) or (rest := steps.all_but(found, i)) is None:
             continue
         base, rankings[i] = rest
+        if found[i].effect is None:
+            continue
         ranking, others = rankings[i], found[:i] + found[i + 1 :]
         # Further lines would come on top of the others, not in the place of this one.
         lines = any(f.name == "bias_periodic" for f in others)

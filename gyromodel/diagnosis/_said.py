@@ -15,6 +15,7 @@ from gyromodel.diagnosis._search import Selection
 from gyromodel.diagnosis._steps import Found, Steps
 from gyromodel.effects import Effect
 from gyromodel.effects.drivers import BiasPeriodic, BiasStep
+from gyromodel.effects.thermometer import TemperatureLag
 from gyromodel.estimate import Estimate
 
 # Parts of an interval by which samples may be off a regular grid before they tell a line from its aliases.
@@ -62,6 +63,8 @@ def told_of_cause(steps: Steps, step: Found, extended: Estimate, known: set[str]
         yield f"{name} is in the simulation, but not in this form: the extended model has it whole."
     if name == "scale_factor":
         yield "A scale error of the rate table would look the same: check it against a second reference."
+    late = [e.late for e in extended.model.effects if isinstance(e, TemperatureLag) and e.label == name]
+    yield from (f"Of thermometer and coil the {part} is late." for part in late)
     if (odds := -steps.scanner.bank.price(name)) > 0.0:
         yield f"Of the evidence for {name}, {odds:.1f} nats are prior odds: every gyro has one."
     if close := _close_rival(step, known):

@@ -111,7 +111,7 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
                 return other
         return Selection(steps.baseline, (), (), path[0].ranking, (steps.baseline,), driver)
     found, left_out = standing(path), {}
-    if sum(f.effect is not None for f in found) > 1:
+    if sum(f.weighed for f in found) > 1:
         before = found
         found, estimates[-1], left_out = exchanged(steps, found, estimates[-1])
         if found != before:

@@ -48,6 +48,11 @@ class Found:
         return is_noise(self.name)
 
     @property
+    def weighed(self) -> bool:
+        """Whether it is weighed again beside all others: what gives up rows alone is not."""
+        return self.effect is not None or self.frees_noise
+
+    @property
     def grows(self) -> bool:
         """Whether there may be more to it than this form; each further line is a cause of its own."""
         return self.effect is not None and self.effect.may_grow and not self.effect.scan
@@ -115,8 +120,10 @@ class Steps:
         # What continues an effect is ranked by its slope alone, which may lose most of it.
         grown = {k for k in ranking.tangents if ranking.statistic.get(k, -np.inf) > max(self.threshold, 0.25 * score)}
         grown = grown if self.scanner.record.domain == "gyro" and max(score, driver) > BY_FIT else set()
-        between = BETWEEN * score >= EXCHANGE and name and (name in ranking.tangents or self.scanner.bank.forms(name))
-        if not name or not (grown or between):
+        if not (grown or BETWEEN * score >= EXCHANGE):
+            return ranking
+        # Of kinds of noise, gross errors, steps and lines there are no forms to fit.
+        if not name or not (name in ranking.tangents or self.scanner.bank.forms(name)):
             return ranking
         least = (1.0 - BETWEEN) * ranking.explained(name)
         near = grown | {k for k in ranking.statistic if self._has_shape(k) and ranking.explained(k) >= least}

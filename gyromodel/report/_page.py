@@ -351,9 +351,9 @@ def _threshold(diagnosis: Diagnosis) -> str:
     bound = number(diagnosis.threshold, 2)
     if diagnosis.threshold_kind == "calibrated":
         return (
-            f"An effect is accepted when its evidence exceeds {bound}. This bound was calibrated: it is what the best "
-            "of all candidates reaches in one of 100 simulations of this campaign with its noise and nothing missing. "
-            f"As much evidence as here is reached in {100 * (diagnosis.p_value or 0.0):.2g} % of them."
+            f"An effect is accepted when its evidence exceeds {bound}. This bound was calibrated: the best of all "
+            "candidates exceeds it in at most one of 100 simulations of this campaign with its noise and nothing "
+            f"missing. As much evidence as here is reached in {100 * (diagnosis.p_value or 0.0):.2g} % of them."
         )
     return (
         f"An effect is accepted when its evidence exceeds {bound}, odds of {_odds(diagnosis.threshold)} after paying "
