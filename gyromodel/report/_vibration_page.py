@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from gyromodel.platform import EXCLUDED, parameters
 from gyromodel.report._numbers import number, with_uncertainty
-from gyromodel.report._page import filled
+from gyromodel.report._template import filled
 from gyromodel.report._vibration_words import explained, notes, vibration_sentence, vibration_words
 
 if TYPE_CHECKING:
