@@ -190,6 +190,8 @@ def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
         columns["time_on"] = _time_on(campaign, time)
         for name in thermometers(names):
             columns[f"{name}_rate"] = _thermometer_rate(time, columns[name])
+        if len(campaigns) == 1 and "run" not in names and (stretches := _stretches(time)).any():
+            columns["run"] = 1.0 + stretches  # for want of a column that tells them
         if len(campaigns) > 1 and "campaign" not in names:
             columns["campaign"] = np.full(len(time), 1.0 + len(blocks))
         columns["output"] = output

@@ -359,6 +359,14 @@ def test_a_missing_covariate_is_named_by_rows(rng: np.random.Generator):
         fit(measured, model_from_effects(["bias", "bias_pressure"]))
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-160, 1e-308])
+def test_what_hardly_moves_the_output_has_no_variance(size: float, rng: np.random.Generator):
+    """A variance beyond all numbers would end a search with an error of linear algebra."""
+    columns = np.stack([np.ones(ROWS), size * rng.standard_normal(ROWS)], axis=1)
+    with pytest.raises(EstimateError, match="bias_drift cannot be estimated: this campaign does not excite it"):
+        _fit.unit_covariance(columns, GyroModel((Bias(value=jnp.asarray(0.0)), BiasDrift(slope=jnp.asarray(0.0)))))
+
+
 def test_two_stages_carry_the_uncertainty_of_the_first(rng: np.random.Generator):
     """A scale factor from one campaign, held in the fit of another: the response by refits at moved values."""
     table, log = campaign(rng), campaign(rng)

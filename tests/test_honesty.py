@@ -143,6 +143,36 @@ def test_a_bias_that_differs_between_campaigns_is_a_turn_on_bias(rng: np.random.
     assert found.causes[0].parameters[0].value == pytest.approx(5.0, abs=4 * found.causes[0].parameters[0].std)
 
 
+def test_a_bias_that_differs_behind_gaps_is_a_turn_on_bias(rng: np.random.Generator) -> None:
+    """Five stretches of a chamber's cycle that no column numbers, flat between short gaps: no loop, line or walk."""
+    stretch = np.repeat(np.arange(5), ROWS // 5)
+    time = 10.0 * np.arange(ROWS) + 300.0 * stretch
+    level = np.array([0.0, 3.0, -2.0, 2.0, 4.0])[stretch]
+    columns = {"time": time, "temperature": 25 + 15 * np.sin(time / 1500.0), "output": level + rng.normal(size=ROWS)}
+    units = {"time": "s", "temperature": "degC", "output": "deg/h"}
+    measured = gm.Campaign(columns, units, {"kind": "rate"})
+    found = gm.diagnose(measured, gm.model_from_effects(["bias", "bias_temperature"]), hold_out=False)
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["bias_turn_on"])
+    assert "There is no column run: each stretch between gaps counts as one." in found.findings
+    for p, truth in zip(found.causes[0].parameters, (3.0, -2.0, 2.0, 4.0), strict=False):
+        assert p.value == pytest.approx(truth, abs=5 * p.std)
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_of_a_gyro_that_is_turned_over_the_earths_rate_is_told_of(told: bool, rng: np.random.Generator) -> None:
+    """Six positions, 10 deg/h of the Earth's vertical rate in the output: the reference has it, or there is none."""
+    up = np.repeat([1.0, 0.0, -1.0, 0.0, 1.0, -1.0], ROWS // 6)
+    rate = 10.0 * up + (np.tile([50.0, -50.0], len(up) // 2) if told else 0.0)
+    columns = {"time": TIME, "acceleration_input": up, "output": rate + 2.0 * up + 0.5 * rng.normal(size=ROWS)}
+    columns |= {"rate": rate / 3600.0} if told else {}
+    units = {n: {"acceleration_input": "g", "rate": "deg/s", "time": "s"}.get(n, "deg/h") for n in columns}
+    measured = gm.Campaign(columns, units, {"kind": "rate", "rate_frame": "inertial"})
+    model = gm.model_from_effects(["bias", "scale_factor"] if told else ["bias"])
+    found = gm.diagnose(measured, model, hold_out=False)
+    assert "bias_acceleration_input" in [c.effect for c in found.causes]
+    assert any("No reference rate is given" in line for line in found.findings) == (not told)
+
+
 def test_lines_have_a_phase_of_their_own_in_each_campaign(rng: np.random.Generator) -> None:
     frequency, phases = 12.37 / TIME[-1], rng.uniform(0, 2 * np.pi, 3)  # off the grid of frequencies
     runs = [campaign(np.sin(2 * np.pi * frequency * TIME + phase) + rng.normal(size=ROWS)) for phase in phases]

@@ -12,7 +12,7 @@ from scipy.stats import binom
 
 import gyromodel as gm
 from gyromodel.compensation import compensate
-from gyromodel.diagnosis._variance import steps_of_output, stretch_still
+from gyromodel.diagnosis._variance import columns_still, steps_of_output, stretch_still
 from gyromodel.effects.memory import BiasThermalHysteresis
 from gyromodel.effects.thermal import BiasTemperatureProduct, BiasTemperatureRate
 from gyromodel.effects.thermometer import TemperatureLag
@@ -344,6 +344,23 @@ def test_a_coarse_output_that_drifts_does_not_stand_still(steps: float, rng: np.
             {"time": np.arange(3000.0), "output": 0.01 * output}, {"time": "s", "output": "deg/s"}, {"kind": "rate"}
         )
         assert stretch_still(campaign) is None
+
+
+@pytest.mark.parametrize(("jump", "noise", "said"), [(3.0, 0.0, True), (3.0, 0.02, True), (0.0, 0.0, False)])
+def test_a_thermometer_dead_for_a_while_is_said_of(jump: float, noise: float, said: bool, rng: np.random.Generator):
+    """It stands at one value and jumps when it lives again; a soak without noise ends in a ramp."""
+    time = 20.0 * np.arange(900)
+    temperature = np.interp(time, [0, 6000, 9000, 15000, 18000], [-20.0, 40.0, 40.0, 10.0, 10.0 + jump])
+    temperature = temperature + noise * rng.standard_normal(900)
+    if jump:
+        temperature[330:420] = temperature[330]
+        temperature[420:] += jump
+    columns = {"time": time, "temperature": temperature, "output": rng.standard_normal(900)}
+    campaign = gm.Campaign(columns, {"time": "s", "temperature": "degC", "output": "deg/h"}, {"kind": "rate"})
+    told = columns_still(campaign)
+    assert len(told) == said
+    assert not said or "temperature stands at" in told[0]
+    assert not (said and noise) or "in data rows 331 to 420 of" in told[0]
 
 
 @pytest.mark.long

@@ -193,6 +193,21 @@ def test_columns_by_x_y_z_keep_their_drivers(rng: np.random.Generator):
     assert "acceleration_z*acceleration_z" not in squared.products
 
 
+def test_a_ripple_of_the_poles_of_a_tables_motor_is_its_harmonic(rng: np.random.Generator):
+    """Eight poles, at speeds that change, so that it is no line: an angle as the drive turns it."""
+    speed = np.repeat(rng.uniform(5.0, 25.0, 30), 20)
+    angle = np.cumsum(speed) * 0.5
+    output = speed + 0.02 * np.cos(8 * np.deg2rad(angle) - 0.9) + 0.02 * rng.standard_normal(600)
+    columns = {"time": 0.5 * np.arange(600), "rate": speed, "table_angle": angle % 360.0, "output": output}
+    units = {"time": "s", "rate": "deg/s", "table_angle": "deg", "output": "deg/s"}
+    measured = Campaign(columns, units, {"kind": "rate"})
+    found = gyromodel.diagnose(measured, gyromodel.model_from_effects(["scale_factor", "bias"]), hold_out=False)
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["table_harmonic"])
+    assert "It returns 8 times a turn of the table." in found.findings
+    size = np.hypot(*(p.value for p in found.causes[0].parameters[:2])) / 3600.0
+    assert size == pytest.approx(0.02, abs=5 * 0.02 * np.sqrt(2 / 600))
+
+
 SUITABLE = (("tumble", "bias_acceleration_squared"), ("turntable", "table_tilt"), ("dynamic_rates", "misalignment"))
 
 

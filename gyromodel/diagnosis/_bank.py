@@ -177,7 +177,7 @@ def _structure(name: str, effect: Effect | None, width: int) -> str:
     if effect is None:
         return f"{name}/{width}"
     shapes = [np.shape(getattr(effect, k)) for k in effect.declared()]
-    return f"{name}/{shapes}/{getattr(effect, 'powers', '')}"
+    return f"{name}/{shapes}/{effect.structure}"
 
 
 def _missing(kind: type[Effect], record: Record, usable: Signals) -> str:

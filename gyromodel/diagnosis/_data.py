@@ -11,7 +11,7 @@ from gyromodel._checks import CampaignError
 from gyromodel.attitude import refuse_navigated, with_reference_rates
 from gyromodel.averages import MEAN_OF_ATTITUDE, MOST_TURN, average, turning
 from gyromodel.campaign import Campaign
-from gyromodel.diagnosis._variance import steps_of_output, stretch_still
+from gyromodel.diagnosis._variance import columns_still, steps_of_output, stretch_still
 from gyromodel.platform import is_platform, vibration_record
 from gyromodel.poses import at_rest
 from gyromodel.signals import Record, read_signals
@@ -87,6 +87,7 @@ def _of_gyro(measured: Sequence[Campaign]) -> Data:
         if m == 1 and len(c) < len(g)
     ]
     findings += [line for of in (steps_of_output, stretch_still) for c in given if (line := of(c))]
+    findings += [line for c in given for line in columns_still(c)]
     searched = tuple(c for c, _ in shortened)
     record = read_signals(searched)
     output_unit = campaigns[0].units["output"]

@@ -22,9 +22,9 @@ SMOOTH_SCALES = (0.08, 0.2, 0.5)
 PAIR_SCALES = (0.25, 0.6)
 # Rates crowd where their order places one this far, of the whole range, from where its value does.
 CROWDED = 0.1
-# A column has a past worth looking at if its steps from row to row are this small beside its own variation; how long
-# before, as parts of a run.
-SLOW, LAGS = 0.05, (0.01, 0.03, 0.08)
+# A column has a past worth looking at if its steps from row to row are this small beside its own variation; through how
+# long a lag what remembers it follows, as parts of a run, and as how smooth a function.
+SLOW, LAGS, PAST_SCALES = 0.05, (0.01, 0.02, 0.04, 0.08, 0.16), (0.2, 0.5)
 # Samples before and after, whose rates stand for a linear response of any form (those after for its smooth part at the
 # ends of a run), and the least part of steps at which rates move.
 RESPONSE, MOVING = (13, 5, 2, 1, -1, -2), 0.5
@@ -85,13 +85,18 @@ def smooths(record: Record) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     for name in (n for n in names if n not in ("rate", "campaign") and _slow(record, n)):
         if is_angle(record.units[name]):
             continue  # it may wrap round, which is no rate of change
-        for derived, values in _history(record, name):
-            yield from _of_one(record, f"smooth({derived})", values)
+        for derived, values, scales in _history(record, name):
+            yield from _of_one(record, f"smooth({derived})", values, scales)
+            # In proportion to it, with no more of a shape; what follows a thermometer so is in the catalogue.
+            if _kind(record, name) != "temperature":
+                yield f"smooth({derived})", values, _product(record, values)
     # What repeats with an oscillation is a function of its angle and rate.
     paired = ("rate", "temperature") if record.domain == "gyro" else ("table", "table_rate")
     rate_first = sorted(names, key=lambda n: n not in paired)[: 3 if record.domain == "gyro" else 2]
+    # A scale factor that changes in time.
+    with_time = ["time"] if "rate" in names and record.domain == "gyro" else []
     for i, a in enumerate(rate_first):
-        for b in rate_first[i + 1 :]:
+        for b in (*rate_first[i + 1 :], *(with_time if a == "rate" else [])):
             x, y = (np.asarray(record.signals[n]) for n in (a, b))
             for scale in PAIR_SCALES:
                 of_x, of_y = _bumps(record, x, scale), _bumps(record, y, scale)
@@ -144,8 +149,10 @@ def driver_unit(record: Record, column: str) -> str:
     return f"{unit or '1'}/s" if form == RATE_OF else unit
 
 
-def _of_one(record: Record, name: str, values: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    for scale in SMOOTH_SCALES:
+def _of_one(
+    record: Record, name: str, values: np.ndarray, scales: tuple[float, ...] = SMOOTH_SCALES
+) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    for scale in scales:
         yield name, values, _bumps(record, values, scale)
 
 
@@ -212,16 +219,29 @@ def _acceleration(record: Record, runs: list[np.ndarray]) -> np.ndarray:
     return along
 
 
-def _history(record: Record, name: str) -> Iterator[tuple[str, np.ndarray]]:
-    """The rate of a column, and the column some times before; what came before a run is its first value."""
+def _history(record: Record, name: str) -> Iterator[tuple[str, np.ndarray, tuple[float, ...]]]:
+    """The rate of a column, what follows the column through lags, and the scales of functions of each."""
     values, time = (np.asarray(record.signals[n])[: record.rows] for n in (name, "time"))
     extra = (0, len(record.signals["time"]) - record.rows)
     rate = np.asarray(record.signals.get(f"{name}_rate", np.zeros(0)))[: record.rows]
     rate = rate if rate.size else thermometer_rate(record, values)
     if np.isfinite(rate).all() and np.ptp(rate) > 0:
-        yield RATE_OF.format(name), np.pad(rate, extra, mode="edge")
+        yield RATE_OF.format(name), np.pad(rate, extra, mode="edge"), SMOOTH_SCALES
     runs = _runs(record)
     span = max(float(np.ptp(time[rows])) for rows in runs)
     for lag in LAGS:
-        before = np.concatenate([np.interp(time[rows] - lag * span, time[rows], values[rows]) for rows in runs])
-        yield EARLIER.format(name), np.pad(before, extra, mode="edge")
+        late = np.concatenate([_followed(time[rows], values[rows], lag * span) for rows in runs])
+        yield EARLIER.format(name), np.pad(late, extra, mode="edge"), PAST_SCALES
+
+
+def _followed(time: np.ndarray, values: np.ndarray, time_constant: float) -> np.ndarray:
+    """What follows a column through a first-order lag, at rest where a run begins; a line between samples."""
+    known = np.isfinite(values)
+    values, steps = np.interp(time, time[known], values[known]), np.diff(time) / time_constant
+    decay = np.exp(-steps)
+    mean = -np.expm1(-steps) / steps
+    drive = (mean - decay) * values[:-1] + (1.0 - mean) * values[1:]
+    late = values.copy()
+    for i, (kept, driven) in enumerate(zip(decay, drive, strict=True)):
+        late[i + 1] = kept * late[i] + driven
+    return late

@@ -15,11 +15,14 @@ from gyromodel.diagnosis._search import Selection
 from gyromodel.diagnosis._steps import Found, Steps
 from gyromodel.effects import Effect
 from gyromodel.effects.drivers import BiasPeriodic, BiasStep
+from gyromodel.effects.geometry import TableHarmonic
 from gyromodel.effects.thermometer import TemperatureLag
 from gyromodel.estimate import Estimate
 
 # Parts of an interval by which samples may be off a regular grid before they tell a line from its aliases.
 IRREGULAR = 0.01
+# Of a gyro that is turned over these follow the Earth's rate too: its vertical part the first, its northern all.
+UNDER_EARTH = ("bias_acceleration_input", "bias_acceleration_output", "bias_acceleration_spin")
 # Gross errors that are listed by row.
 ROWS_TOLD = 12
 
@@ -65,6 +68,16 @@ def told_of_cause(steps: Steps, step: Found, extended: Estimate, known: set[str]
         yield "A scale error of the rate table would look the same: check it against a second reference."
     late = [e.late for e in extended.model.effects if isinstance(e, TemperatureLag) and e.label == name]
     yield from (f"Of thermometer and coil the {part} is late." for part in late)
+    orders = [o for e in extended.model.effects if isinstance(e, TableHarmonic) and e.label == name for o in e.orders]
+    yield from [f"It returns {listed([str(o) for o in orders])} times a turn of the table."] if orders else []
+    signals, units = steps.scanner.record.signals, steps.scanner.record.units
+    if name == "bias_turn_on" and "run" not in units and "campaign" not in signals:
+        yield "There is no column run: each stretch between gaps counts as one."
+    if name in UNDER_EARTH and "rate" not in units:
+        yield (
+            "No reference rate is given: where the Earth's is in the output, biases from acceleration hold up to 15.04 "
+            "deg/h per g of it, which a column rate in inertial space (rate_frame: inertial) would take out."
+        )
     if (odds := -steps.scanner.bank.price(name)) > 0.0:
         yield f"Of the evidence for {name}, {odds:.1f} nats are prior odds: every gyro has one."
     if close := _close_rival(step, known):

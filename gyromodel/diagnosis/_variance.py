@@ -27,6 +27,8 @@ OFTEN, COARSE = 50, 0.5
 # A stretch that stands still is said of from so many repeats on, and where its other values make it less likely;
 # never where more of them repeat than this, as one amid a coarse step then stands by itself.
 FEWEST_REPEATS, CHANCE, MOST_REPEATS = 4, 1e-4, 0.5
+# Times its greatest other step that a column jumps by once a dead sensor lives again.
+JUMP = 2.0
 
 
 def variance_drivers(record: Record) -> dict[str, np.ndarray]:
@@ -169,6 +171,28 @@ def stretch_still(campaign: Campaign) -> str | None:
         f"The output stands at {values[start]:.6g} {campaign.units[name]} in data rows {start + 1} to {stop} of "
         f"{campaign.name}: check whether sensor and logger were alive, as steps at its ends would be theirs."
     )
+
+
+def columns_still(campaign: Campaign) -> list[str]:
+    """Sentences on columns that repeat one value for longer than the others make likely, and then jump."""
+    said = []
+    for name in campaign.covariates:
+        values = campaign.columns[name]
+        steps = np.abs(np.diff(values))
+        edges = np.flatnonzero(np.concatenate([[True], steps != 0.0, [True]]))
+        longest = int(np.argmax(np.diff(edges)))
+        start, stop = edges[longest : longest + 2]
+        others = np.concatenate([steps[: max(start - 1, 0)], steps[stop:]])
+        repeats, share = stop - start - 1, np.mean([*(others == 0.0), True])
+        likely = np.log(len(values)) + repeats * np.log(share)
+        if repeats < FEWEST_REPEATS or stop == len(values) or likely > np.log(CHANCE):
+            continue
+        if np.isfinite(others).all() and steps[stop - 1] > JUMP * others.max():
+            said.append(
+                f"{name} stands at {values[start]:.6g} {campaign.units[name]} in data rows {start + 1} to {stop} of "
+                f"{campaign.name}, and then jumps: check its sensor, as what is found may be that sensor's."
+            )
+    return said
 
 
 def noise_level(estimate: Estimate) -> str | None:

@@ -130,7 +130,8 @@ def judge(
 
     def judged(verdict: Verdict, causes: Sequence[Cause], credible: dict[str, float], **more: str | None) -> Judgement:
         what = {"driver": None, "next_test": None} | more
-        return Judgement(verdict, tuple(causes), credible, unexplained=unexplained, findings=tuple(findings), **what)
+        once = tuple(dict.fromkeys(findings))
+        return Judgement(verdict, tuple(causes), credible, unexplained=unexplained, findings=once, **what)
 
     strongest = max((c.statistic for c in causes), default=0.0)
     if driver and (share > UNKNOWN_SHARE or last.statistic[driver] > UNKNOWN_EVIDENCE * strongest):

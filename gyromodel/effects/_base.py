@@ -150,6 +150,11 @@ class Effect(eqx.Module):
         return replace(self, **{self._amplitude(): amplitude})
 
     @property
+    def structure(self) -> str:
+        """What sets searched forms with equally many parameters apart, as no two shapes of one form are."""
+        return ""
+
+    @property
     def beyond_reach(self) -> bool:
         """Whether this effect, if it continues others, has a larger amplitude than any that is believed."""
         return bool(np.isfinite(self.reach) and abs(getattr(self, self._amplitude())) > self.reach)

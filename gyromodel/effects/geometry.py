@@ -20,6 +20,8 @@ from gyromodel.effects._base import Effect, Signals, parameter, stack
 
 # Harmonics of the table angle that are searched.
 HARMONICS = (1, 2, 3, 4)
+# What poles, teeth and bearings make, each by itself.
+HIGHER = range(5, 37)
 # A rate that differs from a sine of the azimuth by less than this part of itself is one.
 ALIKE = 1e-3
 # Amplitudes of the cosine and of the sine that are searched: both, or one, where the other is known otherwise.
@@ -167,6 +169,11 @@ class TableHarmonic(Effect):
         if not self.cosine.shape == self.sine.shape == (len(self.orders),):
             raise ValueError("every order needs a cosine and a sine")
 
+    @property
+    def structure(self) -> str:
+        """Whether it is of high orders, of which there are many."""
+        return "higher" if min(self.orders) > max(HARMONICS) else ""
+
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """The cosines, then the sines."""
         phase = signals["table_angle"][:, None] * jnp.asarray(self.orders, float)
@@ -175,7 +182,7 @@ class TableHarmonic(Effect):
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
         """Each harmonic by itself, and all up to the second, third or fourth."""
-        each = [(k,) for k in HARMONICS]
+        each = [(k,) for k in (*HARMONICS, *HIGHER)]
         return [cls(orders=o) for o in (*each, *(HARMONICS[:n] for n in (2, 3, 4)))]
 
 

@@ -85,6 +85,11 @@ class ScaleNonlinearity(Effect):
         if self.coefficients.shape != (len(self.powers),):
             raise ValueError(f"{len(self.powers)} powers need as many coefficients")
 
+    @property
+    def structure(self) -> str:
+        """Its powers."""
+        return str(self.powers)
+
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """(rate/full_rate)^(i-1): times the rate, the output error of power i."""
         x = signals["rate"] / self.full_rate

@@ -295,8 +295,9 @@ def unit_covariance(whitened_jacobian: np.ndarray, model: GyroModel) -> np.ndarr
     if not np.isfinite(norm).all():
         lost = _named(model, ~np.isfinite(norm))
         raise EstimateError(f"the fit ran away in {', '.join(lost)}: give start values, or fix some parameters")
-    if (norm == 0).any():
-        silent = _named(model, norm == 0)
+    # Of a smaller one the variance would be no number.
+    if (norm**2 < np.finfo(float).tiny).any():
+        silent = _named(model, norm**2 < np.finfo(float).tiny)
         raise EstimateError(
             f"{', '.join(silent)} cannot be estimated: this campaign does not excite it; remove it or fix it"
         )

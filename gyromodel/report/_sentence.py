@@ -80,11 +80,11 @@ def _unknown(diagnosis: Diagnosis) -> str:
         follows = f"follows {driver_name(column)}"
     elif "bias_periodic" in diagnosis.credible_set:
         follows = "oscillates with a size or a frequency that changes,"
-    lead = f"Something real is missing from your simulation: its error {follows}"
-    if diagnosis.causes:
-        lead = f"{_lacks(diagnosis.causes)}; the error that remains {follows}"
+    lead = f"Something real is missing from your simulation: its error {follows} and matches nothing in the catalogue"
+    if effects := [cause for cause in diagnosis.causes if cause.effect != "outliers"]:
+        lead += f", though {_sized(effects)} would take up part of it"
     gain = _gain(diagnosis, "with the curve that was found" if diagnosis.driver else "with what was found")
-    return f"{lead} and matches nothing in the catalogue; {gain}."
+    return f"{lead}; {gain}."
 
 
 def _pronoun(causes: Sequence[Cause]) -> str:
@@ -99,18 +99,22 @@ def _lacks(causes: Sequence[Cause]) -> str:
     apart = sum(len(cause.points) for cause in causes if cause.effect == "outliers")
     what = "point, which stands" if apart == 1 else "points, which stand"
     points = f"cannot explain {apart or 'some'} measured {what} apart from all the others"
-    items = [_with_size(cause) for cause in effects]
     if not causes:
         return "Something real is missing from your simulation"
-    if not items:
+    if not effects:
         return f"Your simulation {points}"
-    if len(items) > 1 and any(len(cause.parameters) > 1 for cause in effects):
-        text = f"{'; '.join(items[:-1])}; and {items[-1]}"
-    else:
-        text = listed(items)
+    text = _sized(effects)
     if len(effects) < len(causes):
         text += f", and {points}"
     return f"Your simulation lacks {text}"
+
+
+def _sized(effects: Sequence[Cause]) -> str:
+    """Effects with their sizes, in a list."""
+    items = [_with_size(cause) for cause in effects]
+    if len(items) > 1 and any(len(cause.parameters) > 1 for cause in effects):
+        return f"{'; '.join(items[:-1])}; and {items[-1]}"
+    return listed(items)
 
 
 def _with_size(cause: Cause) -> str:
@@ -134,6 +138,8 @@ def _gain(diagnosis: Diagnosis, extension: str) -> str:
     before, after = pair(gain.before, gain.after)
     unit = unit_text(gain.unit)
     if gain.before == gain.after:
+        if diagnosis.causes:
+            return f"the error on data not used stays at {before} {unit}"
         return f"the model is left as it is, with an error on data not used of {before} {unit}"
     low, high = gain.ci95
     if low > 1.0:

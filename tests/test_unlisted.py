@@ -1,0 +1,55 @@
+"""Errors that no catalogue lists are unknown, and follow the right column; each simulated by its own physics."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import gyromodel as gm
+
+STEP = 15.0
+TIME = STEP * np.arange(1200)
+
+
+def log(output: np.ndarray, rng: np.random.Generator, **columns: np.ndarray) -> gm.Campaign:
+    """A log in deg/h under white noise of 0.05 deg/h."""
+    units = {"pressure": "hPa", "temperature": "degC", "rate": "deg/s"}
+    noisy = output + 0.05 * rng.standard_normal(len(output))
+    of = {"time": TIME, **columns, "output": noisy}
+    return gm.Campaign(of, {n: units.get(n, "s" if n == "time" else "deg/h") for n in of}, {"kind": "rate"})
+
+
+def leaked(values: np.ndarray, step: float, time_constant: float) -> np.ndarray:
+    """A vessel that fills through a leak, in steps much shorter than it takes."""
+    inside = np.empty_like(values)
+    inside[0] = values[0]
+    for i in range(1, len(values)):
+        inside[i] = inside[i - 1] + step / time_constant * (values[i - 1] - inside[i - 1])
+    return inside
+
+
+@pytest.mark.parametrize("leak", [300.0, 500.0, 1500.0])
+def test_what_follows_a_column_through_a_lag_is_told_of_that_column(leak: float, rng: np.random.Generator):
+    """An altitude chamber's steps, felt through a leak of the housing, which a random walk would imitate."""
+    fine = np.arange(0.0, TIME[-1] + 1.0)
+    levels = rng.permutation([101.0, 60.0, 30.0, 80.0, 20.0, 95.0, 50.0, 70.0])
+    outside = leaked(levels[np.minimum(fine // 2250, 7).astype(int)], 1.0, 30.0)
+    inside = np.interp(TIME, fine, leaked(outside, 1.0, leak))
+    temperature = 25.0 + 0.5 * np.cumsum(rng.standard_normal(len(TIME))) / 30.0
+    pressure = 10.0 * np.interp(TIME, fine, outside) + 0.3 * rng.standard_normal(len(TIME))
+    measured = log(0.5 + 0.004 * (inside - 60.0), rng, temperature=temperature, pressure=pressure)
+    found = gm.diagnose(measured, gm.model_from_effects(["bias", "bias_temperature"]), hold_out=False)
+    assert found.verdict == "unknown"
+    assert found.driver is not None
+    assert found.driver.column == "pressure[earlier]"
+
+
+def test_a_scale_factor_that_warms_up_follows_rate_and_time(rng: np.random.Generator):
+    """No step, no drift, and no set of anomalous dwells: an exponential of 30 standard deviations."""
+    rate = np.tile(np.repeat([0.0, 50.0, -50.0, 100.0, -100.0, 0.0], 10), 20)
+    warming = 1.2e-6 * 3600.0 * rate * np.exp(-TIME / 2700.0)
+    measured = log(3600.0 * rate + 5.0 + warming, rng, rate=rate, temperature=60 + 0.05 * rng.standard_normal(1200))
+    found = gm.diagnose(measured, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
+    assert found.verdict == "unknown"
+    assert found.driver is not None
+    assert found.driver.column == "rate and time"
