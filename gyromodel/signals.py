@@ -23,6 +23,8 @@ from gyromodel.units import UnitError, convertible, factor, internal_unit, quant
 GAP = 10.0
 # And one this many times the median within runs, where a run begins, is time in which the gyro was off.
 OFF = 1.5
+# Part of its range within which a column stands still in a stretch.
+STILL = 0.1
 # Longer records are padded less: the work outweighs the compiling.
 FINER_FROM = 4096
 # A clock is regular if most steps differ by less than this part of the median one; the others are gaps.
@@ -147,6 +149,17 @@ def _stretches(time: np.ndarray) -> np.ndarray:
     return np.concatenate([[0], np.cumsum(step > GAP * typical)]).astype(int)
 
 
+def _are_runs(campaign: Campaign, stretches: np.ndarray) -> bool:
+    """Whether stretches between gaps may be power cycles: not where a column stands still in each, and not in all.
+
+    Soaks at one temperature each are no runs, and what follows the temperature is no offset of theirs.
+    """
+    rows = [np.flatnonzero(stretches == k) for k in range(stretches.max() + 1)]
+    each = (campaign.columns[name] for name in campaign.covariates)
+    moving = (not np.median([np.ptp(v[r]) for r in rows]) < STILL * np.ptp(v) for v in each)
+    return len(rows) > 1 and all(moving)
+
+
 def _blocks(campaign: Campaign, time: np.ndarray) -> tuple[np.ndarray, str]:
     """Stretches that replicate the driver: runs between gaps, else the segment or run column, else equal parts."""
     stretches = _stretches(time)
@@ -190,8 +203,8 @@ def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
         columns["time_on"] = _time_on(campaign, time)
         for name in thermometers(names):
             columns[f"{name}_rate"] = _thermometer_rate(time, columns[name])
-        if len(campaigns) == 1 and "run" not in names and (stretches := _stretches(time)).any():
-            columns["run"] = 1.0 + stretches  # for want of a column that tells them
+        if len(campaigns) == 1 and "run" not in names and _are_runs(campaign, stretches := _stretches(time)):
+            columns["run"] = 1.0 + stretches
         if len(campaigns) > 1 and "campaign" not in names:
             columns["campaign"] = np.full(len(time), 1.0 + len(blocks))
         columns["output"] = output

@@ -158,6 +158,16 @@ def test_a_bias_that_differs_behind_gaps_is_a_turn_on_bias(rng: np.random.Genera
         assert p.value == pytest.approx(truth, abs=5 * p.std)
 
 
+def test_soaks_at_one_temperature_each_are_no_runs(rng: np.random.Generator) -> None:
+    """Five soaks between gaps: what follows their temperature in any way is no offset of theirs."""
+    soak = np.repeat(np.arange(5), ROWS // 5)
+    temperature = np.array([-20.0, 0.0, 20.0, 40.0, 60.0])[soak] + 0.1 * rng.normal(size=ROWS)
+    measured = campaign(rng.normal(size=ROWS), TIME + 3000.0 * soak, temperature=temperature)
+    assert "run" not in read_signals(measured).signals
+    cycled = campaign(rng.normal(size=ROWS), TIME + 3000.0 * soak, temperature=20 + 30 * np.sin(TIME / 400.0))
+    assert np.unique(read_signals(cycled).signals["run"]).tolist() == [1.0, 2.0, 3.0, 4.0, 5.0]
+
+
 @pytest.mark.parametrize("told", [True, False])
 def test_of_a_gyro_that_is_turned_over_the_earths_rate_is_told_of(told: bool, rng: np.random.Generator) -> None:
     """Six positions, 10 deg/h of the Earth's vertical rate in the output: the reference has it, or there is none."""
