@@ -154,10 +154,15 @@ def _are_runs(campaign: Campaign, stretches: np.ndarray) -> bool:
 
     Soaks at one temperature each are no runs, and what follows the temperature is no offset of theirs.
     """
-    rows = [np.flatnonzero(stretches == k) for k in range(stretches.max() + 1)]
-    each = (campaign.columns[name] for name in campaign.covariates)
-    moving = (not np.median([np.ptp(v[r]) for r in rows]) < STILL * np.ptp(v) for v in each)
-    return len(rows) > 1 and all(moving)
+    if not stretches.any():
+        return False
+    for values in (campaign.columns[name] for name in campaign.covariates):
+        known = np.isfinite(values)
+        own, stretch = values[known], stretches[known]
+        parts = np.split(own, np.flatnonzero(np.diff(stretch)) + 1)
+        if own.size and np.median([np.ptp(part) for part in parts]) < STILL * np.ptp(own):
+            return False
+    return True
 
 
 def _blocks(campaign: Campaign, time: np.ndarray) -> tuple[np.ndarray, str]:

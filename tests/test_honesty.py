@@ -162,6 +162,7 @@ def test_soaks_at_one_temperature_each_are_no_runs(rng: np.random.Generator) -> 
     """Five soaks between gaps: what follows their temperature in any way is no offset of theirs."""
     soak = np.repeat(np.arange(5), ROWS // 5)
     temperature = np.array([-20.0, 0.0, 20.0, 40.0, 60.0])[soak] + 0.1 * rng.normal(size=ROWS)
+    temperature[[3, 100]] = np.nan
     measured = campaign(rng.normal(size=ROWS), TIME + 3000.0 * soak, temperature=temperature)
     assert "run" not in read_signals(measured).signals
     cycled = campaign(rng.normal(size=ROWS), TIME + 3000.0 * soak, temperature=20 + 30 * np.sin(TIME / 400.0))

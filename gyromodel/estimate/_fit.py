@@ -296,11 +296,10 @@ def unit_covariance(whitened_jacobian: np.ndarray, model: GyroModel) -> np.ndarr
         lost = _named(model, ~np.isfinite(norm))
         raise EstimateError(f"the fit ran away in {', '.join(lost)}: give start values, or fix some parameters")
     # Of a smaller one the variance would be no number.
-    if (norm**2 < np.finfo(float).tiny).any():
-        silent = _named(model, norm**2 < np.finfo(float).tiny)
-        raise EstimateError(
-            f"{', '.join(silent)} cannot be estimated: this campaign does not excite it; remove it or fix it"
-        )
+    silent = norm**2 < np.finfo(float).tiny
+    if silent.any():
+        names = ", ".join(_named(model, silent))
+        raise EstimateError(f"{names} cannot be estimated: this campaign does not excite it; remove it or fix it")
     r = np.linalg.qr(whitened_jacobian / norm, mode="r")
     _, singular, directions = np.linalg.svd(r)
     weak = directions[singular < SINGULAR * singular[0]]
