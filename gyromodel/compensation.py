@@ -179,7 +179,7 @@ def _counts(calibration: Calibration, record: Record, rate: np.ndarray, std: np.
         counts[name] += int((present & ((values < low - margin) | (values > high + margin))).sum())
     for i, effect in enumerate(calibration.model.effects):
         if isinstance(effect, BiasTurnOn):
-            run = np.asarray(record.signals.get("run", np.ones(len(present))))[: record.rows]
+            run = np.asarray(record.signals["run"])[: record.rows]
             counts[f"run {i}"] += int((present & ~np.isin(run, np.asarray(effect.runs))).sum())
     return counts
 

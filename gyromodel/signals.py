@@ -23,8 +23,6 @@ from gyromodel.units import UnitError, convertible, factor, internal_unit, quant
 GAP = 10.0
 # And one this many times the median within runs, where a run begins, is time in which the gyro was off.
 OFF = 1.5
-# Part of its range within which a column stands still in a stretch.
-STILL = 0.1
 # Longer records are padded less: the work outweighs the compiling.
 FINER_FROM = 4096
 # A clock is regular if most steps differ by less than this part of the median one; the others are gaps.
@@ -143,31 +141,16 @@ def rate_scale(stated: str, unit: str) -> float:
     raise UnitError(f"it is in [{own}]" if value else "it is zero")
 
 
-def _stretches(time: np.ndarray) -> np.ndarray:
+def stretches_of(time: np.ndarray) -> np.ndarray:
+    """The number of each sample's stretch between gaps, from 0."""
     step = np.diff(time)
     typical = np.median(step)
     return np.concatenate([[0], np.cumsum(step > GAP * typical)]).astype(int)
 
 
-def _are_runs(campaign: Campaign, stretches: np.ndarray) -> bool:
-    """Whether stretches between gaps may be power cycles: not where a column stands still in each, and not in all.
-
-    Soaks at one temperature each are no runs, and what follows the temperature is no offset of theirs.
-    """
-    if not stretches.any():
-        return False
-    for values in (campaign.columns[name] for name in campaign.covariates):
-        known = np.isfinite(values)
-        own, stretch = values[known], stretches[known]
-        parts = np.split(own, np.flatnonzero(np.diff(stretch)) + 1)
-        if own.size and np.median([np.ptp(part) for part in parts]) < STILL * np.ptp(own):
-            return False
-    return True
-
-
 def _blocks(campaign: Campaign, time: np.ndarray) -> tuple[np.ndarray, str]:
     """Stretches that replicate the driver: runs between gaps, else the segment or run column, else equal parts."""
-    stretches = _stretches(time)
+    stretches = stretches_of(time)
     if 4 <= stretches.max() + 1 <= 60:
         return stretches, "stretches between gaps"
     for name in ("segment", "run", "position"):
@@ -208,8 +191,6 @@ def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
         columns["time_on"] = _time_on(campaign, time)
         for name in thermometers(names):
             columns[f"{name}_rate"] = _thermometer_rate(time, columns[name])
-        if len(campaigns) == 1 and "run" not in names and _are_runs(campaign, stretches := _stretches(time)):
-            columns["run"] = 1.0 + stretches
         if len(campaigns) > 1 and "campaign" not in names:
             columns["campaign"] = np.full(len(time), 1.0 + len(blocks))
         columns["output"] = output
@@ -279,7 +260,7 @@ def thermometer_rate(record: Record, temperature: np.ndarray) -> np.ndarray:
 
 def _thermometer_rate(time: np.ndarray, temperature: np.ndarray) -> np.ndarray:
     """dT/dt of the smoothed thermometer, each stretch by itself; a sample alone takes the slope to its neighbours."""
-    stretch = _stretches(time)
+    stretch = stretches_of(time)
     good = np.isfinite(temperature)
     rate = np.full(len(time), np.nan)
     if good.sum() < 2:

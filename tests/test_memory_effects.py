@@ -12,7 +12,7 @@ from scipy.stats import binom
 
 import gyromodel as gm
 from gyromodel.compensation import compensate
-from gyromodel.diagnosis._variance import columns_still, steps_of_output, stretch_still
+from gyromodel.diagnosis._variance import steps_of_output, stretch_still, thermometers_still
 from gyromodel.effects.memory import BiasThermalHysteresis
 from gyromodel.effects.thermal import BiasTemperatureProduct, BiasTemperatureRate
 from gyromodel.effects.thermometer import TemperatureLag
@@ -357,7 +357,7 @@ def test_a_thermometer_dead_for_a_while_is_said_of(jump: float, noise: float, sa
         temperature[420:] += jump
     columns = {"time": time, "temperature": temperature, "output": rng.standard_normal(900)}
     campaign = gm.Campaign(columns, {"time": "s", "temperature": "degC", "output": "deg/h"}, {"kind": "rate"})
-    told = columns_still(campaign)
+    told = thermometers_still(campaign)
     assert len(told) == said
     assert not said or "temperature stands at" in told[0]
     assert not (said and noise) or "in data rows 331 to 420 of" in told[0]

@@ -11,14 +11,16 @@ from gyromodel._checks import CampaignError
 from gyromodel.attitude import refuse_navigated, with_reference_rates
 from gyromodel.averages import MEAN_OF_ATTITUDE, MOST_TURN, average, turning
 from gyromodel.campaign import Campaign
-from gyromodel.diagnosis._variance import columns_still, steps_of_output, stretch_still
+from gyromodel.diagnosis._variance import steps_of_output, stretch_still, thermometers_still
 from gyromodel.platform import is_platform, vibration_record
 from gyromodel.poses import at_rest
-from gyromodel.signals import Record, read_signals
+from gyromodel.signals import Record, read_signals, stretches_of
 from gyromodel.units import convertible
 
 # What a pose tells is in its mean: within it, means over so long (s) are enough, and keep out a hand's tremor.
 MEAN_OF_POSE = 1.0
+# Part of its range within which a column stands still in a stretch; stretches that may be runs, fewer than are dwells.
+STILL, MOST_STRETCHES = 0.1, 11
 
 
 @dataclass(frozen=True)
@@ -60,9 +62,15 @@ def read(measured: Sequence[Campaign], without: str = "") -> Data:
 
 def _of_gyro(measured: Sequence[Campaign]) -> Data:
     refuse_navigated(measured)
+    as_given, measured = measured, [_with_runs(measured[0])] if len(measured) == 1 else measured
     given, of_attitude = zip(*(with_reference_rates(c) for c in measured), strict=True)
     campaigns = [at_rest(c) for c in given]
     findings = [line for line in of_attitude if line]
+    if "run" in measured[0].columns and "run" not in as_given[0].columns:
+        findings.append(
+            "There is no column run: each stretch between gaps counts as one. A model with bias_turn_on is applied to "
+            "files that have the column."
+        )
     findings += [
         f"{len(np.unique(posed.columns['position']))} static poses were found in {c.name}; {len(c) - len(posed)} rows "
         "in motion were left out."
@@ -87,7 +95,7 @@ def _of_gyro(measured: Sequence[Campaign]) -> Data:
         if m == 1 and len(c) < len(g)
     ]
     findings += [line for of in (steps_of_output, stretch_still) for c in given if (line := of(c))]
-    findings += [line for c in given for line in columns_still(c)]
+    findings += [line for c in given for line in thermometers_still(c)]
     searched = tuple(c for c, _ in shortened)
     record = read_signals(searched)
     output_unit = campaigns[0].units["output"]
@@ -96,6 +104,24 @@ def _of_gyro(measured: Sequence[Campaign]) -> Data:
     whole = searched[0] if len(searched) == 1 else _together(searched)
     rows_of = tuple((c, c is m) for c, m in zip(searched, measured, strict=True))
     return Data(record, searched, rows_of, whole, tuple(findings), _rate_unit(campaigns[0]), output_unit)
+
+
+def _with_runs(campaign: Campaign) -> Campaign:
+    """The campaign with its stretches between gaps numbered as runs, where no column does and they may be power cycles.
+
+    Not where a column stands still in each: soaks at one temperature are no runs, and what follows the temperature is
+    no offset of theirs. A column that drifts through many stretches stands still in each of them.
+    """
+    stretches = stretches_of(campaign.columns["time"])
+    if "run" in campaign.columns or not 0 < stretches.max() < MOST_STRETCHES:
+        return campaign
+    for values in (campaign.columns[name] for name in campaign.covariates):
+        known = np.isfinite(values)
+        own, stretch = values[known], stretches[known]
+        parts = np.split(own, np.flatnonzero(np.diff(stretch)) + 1)
+        if own.size and np.median([np.ptp(part) for part in parts]) < STILL * np.ptp(own):
+            return campaign
+    return campaign.with_column("run", 1.0 + stretches, "")
 
 
 def _rate_unit(campaign: Campaign) -> str:

@@ -236,10 +236,7 @@ def _history(record: Record, name: str) -> Iterator[tuple[str, np.ndarray, tuple
 
 def _followed(time: np.ndarray, values: np.ndarray, time_constant: float) -> np.ndarray:
     """What follows a column through a first-order lag, at rest where a run begins; a line between samples."""
-    known = np.isfinite(values)
-    if not known.any():
-        return np.zeros_like(values)  # of no use to rows that were measured
-    values, steps = np.interp(time, time[known], values[known]), np.diff(time) / time_constant
+    steps = np.diff(time) / time_constant
     decay = np.exp(-steps)
     mean = -np.expm1(-steps) / steps
     drive = (mean - decay) * values[:-1] + (1.0 - mean) * values[1:]

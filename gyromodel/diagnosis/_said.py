@@ -70,10 +70,7 @@ def told_of_cause(steps: Steps, step: Found, extended: Estimate, known: set[str]
     yield from (f"Of thermometer and coil the {part} is late." for part in late)
     orders = [o for e in extended.model.effects if isinstance(e, TableHarmonic) and e.label == name for o in e.orders]
     yield from [f"It returns {listed([str(o) for o in orders])} times a turn of the table."] if orders else []
-    signals, units = steps.scanner.record.signals, steps.scanner.record.units
-    if name == "bias_turn_on" and "run" not in units and "campaign" not in signals:
-        yield "There is no column run: each stretch between gaps counts as one."
-    if name in UNDER_EARTH and "rate" not in units:
+    if name in UNDER_EARTH and "rate" not in steps.scanner.record.units:
         yield (
             "No reference rate is given: where the Earth's is in the output, biases from acceleration hold up to 15.04 "
             "deg/h per g of it, which a column rate in inertial space (rate_frame: inertial) would take out."

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
+from gyromodel._checks import thermometers
 from gyromodel.campaign import Campaign
 from gyromodel.declarations import RATE_OF
 from gyromodel.estimate import Estimate
@@ -173,10 +174,10 @@ def stretch_still(campaign: Campaign) -> str | None:
     )
 
 
-def columns_still(campaign: Campaign) -> list[str]:
-    """Sentences on columns that repeat one value for longer than the others make likely, and then jump."""
+def thermometers_still(campaign: Campaign) -> list[str]:
+    """Sentences on thermometers that repeat one value for longer than the others make likely, and then jump."""
     said = []
-    for name in campaign.covariates:
+    for name in thermometers(campaign.columns):
         values = campaign.columns[name]
         steps = np.abs(np.diff(values))
         edges = np.flatnonzero(np.concatenate([[True], steps != 0.0, [True]]))
@@ -187,7 +188,7 @@ def columns_still(campaign: Campaign) -> list[str]:
         likely = np.log(len(values)) + repeats * np.log(share)
         if repeats < FEWEST_REPEATS or stop == len(values) or likely > np.log(CHANCE):
             continue
-        if np.isfinite(others).all() and steps[stop - 1] > JUMP * others.max():
+        if steps[stop - 1] > JUMP * np.nanmax(others):
             said.append(
                 f"{name} stands at {values[start]:.6g} {campaign.units[name]} in data rows {start + 1} to {stop} of "
                 f"{campaign.name}, and then jumps: check its sensor, as what is found may be that sensor's."

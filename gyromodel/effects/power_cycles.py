@@ -18,9 +18,8 @@ MOST_RUNS = 40
 class BiasTurnOn(Effect):
     """D += D_k in power cycle k, 0 in the first: a bias of its own after every turn-on.
 
-    Cycles are told by the column `run`, else by the campaigns that are read together, else by gaps (unless a column
-    stands still between them, as in soaks). Where several campaigns share the number of a run, their runs are counted
-    on.
+    Cycles are told by the column `run`, else by the campaigns that are read together; where several campaigns share the
+    number of a run, their runs are counted on.
     """
 
     id = "bias_turn_on"

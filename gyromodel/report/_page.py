@@ -330,7 +330,7 @@ def _threshold(diagnosis: Diagnosis) -> str:
     if diagnosis.threshold_kind == "calibrated":
         return (
             f"An effect is accepted when its evidence exceeds {bound}. This bound was calibrated: the best of all "
-            "candidates exceeds it in at most one of 100 simulations of this campaign with its noise and nothing "
+            "candidates exceeds it in one of 100 simulations or fewer of this campaign with its noise and nothing "
             f"missing. As much evidence as here is reached in {100 * (diagnosis.p_value or 0.0):.2g} % of them."
         )
     return (
