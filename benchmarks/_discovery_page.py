@@ -50,6 +50,7 @@ def write_page(output: Path, whole: list[Kept]) -> None:
     uniform, lowest, count = levels.uniform_p_values(parts["calibrated"])
     size, error = levels.mean_set_size(sized[3.0])
     at_three = sum(r.isolable for r in sized[3.0])
+    kinds = [kind for k in whole for kind in k.kinds]
     controls, control_checks = _controls(nulls, sized[3.0], unknown[3.0])
     tenth = binomtest(round(lowest * count), count, 0.1).pvalue > 0.05
     small, three = size - 1.96 * error <= levels.SET_SIZE, f"{size:.2f} ± {error:.2f}"
@@ -61,6 +62,7 @@ def write_page(output: Path, whole: list[Kept]) -> None:
         _spent(whole[-1].seconds),
         *(_leak(sized[s], s) for s in (1.0, 3.0)),
         *_beside_names(sized[1.0]),
+        _kinds_told(kinds),
         *control_checks,
         *mutant_checks,
     ]
@@ -224,6 +226,13 @@ def _beside_names(records: list[study.Record]) -> list[str]:
         "detected, and the right name first, alone or in a set, 1×": levels.told_first(records),
     }
     return [f"| 5 | {k} | – | – | {100 * n / max(m, 1):.1f} % | {m} | – | |" for k, (n, m) in counted.items()]
+
+
+def _kinds_told(kinds: list[tuple[str, str]]) -> str:
+    """Row 14 of an oracle that knows how the levels of the noise are drawn, on the same campaigns."""
+    right = sum(said == drawn for drawn, said in kinds)
+    measured = f"{100 * right / max(len(kinds), 1):.1f} %"
+    return f"| 14 | what bounds it: noise class by an oracle | – | – | {measured} | {len(kinds)} | – | |"
 
 
 def _mutants(parts: dict[str, list[study.Record]]) -> tuple[list[str], list[str]]:

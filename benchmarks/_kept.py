@@ -34,7 +34,7 @@ def code() -> str:
 
 
 class Kept:
-    """The parts of a study with one seed: records by label, and what one process timed."""
+    """The parts of a study with one seed: records by label, noise as an oracle tells it, what one process timed."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -42,12 +42,14 @@ class Kept:
         self.code: str = stored.get("code", "")
         self.scale: float = stored.get("scale", 0.0)
         self.seconds: list[tuple[str, int, float]] = [tuple(row) for row in stored.get("seconds", [])]
+        self.kinds: list[tuple[str, str]] = [tuple(row) for row in stored.get("kinds", [])]
         self.parts = {label: [_record(r) for r in records] for label, records in stored.get("parts", {}).items()}
 
     def save(self) -> None:
         """Write all of it, in one step."""
         parts = {label: [_plain(r) for r in records] for label, records in self.parts.items()}
-        stored = {"code": self.code, "scale": self.scale, "seconds": self.seconds, "parts": parts}
+        stored = {"code": self.code, "scale": self.scale, "seconds": self.seconds, "kinds": self.kinds}
+        stored["parts"] = parts
         text = json.dumps(stored, default=_value, separators=(",", ":"))
         self.path.parent.mkdir(parents=True, exist_ok=True)
         part = self.path.with_suffix(".part")

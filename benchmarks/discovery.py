@@ -139,6 +139,10 @@ def main(argv: list[str] | None = None) -> None:
                 kept.parts[label] = study.run_cases(cases, args.workers, **options)
                 kept.save()
                 print(f"{label}: {len(cases)} campaigns, {time.time() - start:.0f} s", file=sys.stderr, flush=True)
+        if not kept.kinds:
+            nulls = kept.parts["nothing"] + kept.parts["nothing, moving"]
+            kept.kinds = study.in_processes(study.oracle_kind, [r.case for r in nulls], args.workers)
+            kept.save()
         if not kept.seconds:
             kept.seconds = _timed(args.seed + 70)
             kept.save()

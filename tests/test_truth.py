@@ -3,6 +3,8 @@ into a slab, the Sagnac sine, power of a z-test), never the package's own output
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import quad
@@ -378,3 +380,18 @@ def test_simulators_share_no_code_with_the_package():
         "import sys, tests.truth.study; sys.exit(any(m.partition('.')[0] in ('gyromodel', 'jax') for m in sys.modules))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_oracle_of_noise_is_right_as_often_as_it_says(rng):
+    rows, right, sure = 250, [], []
+    for kind in noise.FAMILY * 10:
+        design = DESIGNS[C](rng)
+        design = replace(design, index=design.index[:rows], true={k: v[:rows] for k, v in design.true.items()})
+        data = 1e-3 + noise.draw(kind, design, rng).sample(design, rng)
+        shares = noise.kind_shares(data, design, np.ones((rows, 1)))
+        assert sum(shares.values()) == pytest.approx(1.0)
+        right.append(kind == max(shares, key=shares.__getitem__))
+        sure.append(max(shares.values()))
+    scatter = np.sqrt(sum(p * (1 - p) for p in sure))
+    assert abs(sum(right) - sum(sure)) < norm.isf(RARE / 2) * scatter
+    assert np.mean(right) > 0.4  # a guess: 0.25

@@ -11,7 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.linalg import cholesky, solve_triangular
 from scipy.signal import lfilter, oaconvolve
+from scipy.special import logsumexp
 
 from .designs import Design
 
@@ -137,12 +139,25 @@ def _fractional_covariance(rows: np.ndarray, alpha: float) -> Array:
     return H @ H.T
 
 
+# Decades of the number of samples at which the Allan curves of flicker and of random walk cross the white: 5 to 40,
+# and 10 to 60.
+FLICKER, WALK = (0.7, 1.6), (1.0, 1.8)
+
+
+def _flicker_level(N: float, step: float, decade: float) -> float:
+    return N / (0.664 * np.sqrt(10**decade * step))
+
+
+def _walk_level(N: float, step: float, decade: float) -> float:
+    return np.sqrt(3) * N / (10**decade * step)
+
+
 def draw(kind: str, design: Design, rng: np.random.Generator) -> Noise:
     """Draw levels: white of a real gyro, coloured terms that cross it within a small part of the campaign."""
     N = np.deg2rad(10 ** rng.uniform(*design.white)) / 60
     dt = design.step
-    B = N / (0.664 * np.sqrt(10 ** rng.uniform(0.7, 1.6) * dt))  # Allan curves cross at 5 ... 40 samples
-    K = np.sqrt(3) * N / (10 ** rng.uniform(1.0, 1.8) * dt)  # 10 ... 60 samples
+    B = _flicker_level(N, dt, rng.uniform(*FLICKER))
+    K = _walk_level(N, dt, rng.uniform(*WALK))
     match kind:
         case "white":
             return Noise(kind, N)
@@ -164,3 +179,39 @@ def draw(kind: str, design: Design, rng: np.random.Generator) -> Noise:
         case "grows_with_temperature_rate":
             return Noise(kind, N, growth=("temperature_rate", 3.0))
     raise ValueError(f"no noise kind {kind!r}")
+
+
+def kind_shares(data: Array, design: Design, fixed: Array) -> dict[str, float]:
+    """Share of the posterior of each kind of the family: what an oracle can tell that knows how `draw` draws.
+
+    All kinds are as likely, and their crossings have the law of `draw`; the white level (any, log-uniform) and the
+    coefficients of the columns of `fixed` are integrated out in closed form.
+    """
+    rows, step, points = design.index, design.step, (np.arange(10) + 0.5) / 10
+    white = Noise("white", 1.0).covariance(design)
+    flickers = _flicker_level(1.0, step, FLICKER[0] + np.ptp(FLICKER) * points)
+    walks = _walk_level(1.0, step, WALK[0] + np.ptp(WALK) * points)
+    flicker = [driving_variance(B, 1.0, step) * _fractional_covariance(rows, 1.0) for B in flickers]
+    walk = [driving_variance(K, 2.0, step) * _fractional_covariance(rows, 2.0) for K in walks]
+    covariances = {
+        "white": [white],
+        "flicker": (white + f for f in flicker),
+        "random_walk": (white + w for w in walk),
+        "flicker_and_walk": (white + f + w for f in flicker for w in walk),
+    }
+    scores = {kind: _mean_evidence([_evidence(data, V, fixed) for V in each]) for kind, each in covariances.items()}
+    total = logsumexp(list(scores.values()))
+    return {kind: float(np.exp(score - total)) for kind, score in scores.items()}
+
+
+def _mean_evidence(values: list[float]) -> float:
+    return float(logsumexp(values) - np.log(len(values)))
+
+
+def _evidence(data: Array, covariance: Array, fixed: Array) -> float:
+    """Ln of the likelihood of a covariance of unknown scale, the coefficients of `fixed` at any value."""
+    L = cholesky(covariance, lower=True)
+    whitened = solve_triangular(L, np.column_stack([fixed, data]), lower=True)
+    R = np.linalg.qr(whitened, mode="r")
+    freedom = len(data) - fixed.shape[1]
+    return float(-np.log(np.diag(L)).sum() - np.log(np.abs(np.diag(R)[:-1])).sum() - freedom * np.log(abs(R[-1, -1])))

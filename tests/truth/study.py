@@ -6,9 +6,10 @@ import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations, cycle
 from multiprocessing import get_context
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.stats import norm
@@ -21,7 +22,7 @@ from .mde import Oracle, baseline, oracle, parts
 from .motion import MOTION_EFFECTS
 from .motion_designs import MOTION_DESIGNS
 from .mutants import mutated
-from .noise import FAMILY, Noise, draw
+from .noise import FAMILY, Noise, draw, kind_shares
 from .verdicts import Answer, Score, judge
 
 Array = np.ndarray
@@ -29,6 +30,7 @@ Array = np.ndarray
 SLOW = ("bias_drift", "bias_step", "bias_warmup")
 # The noise of a kind on a design.
 NoiseOf = Callable[[str, Design], Noise]
+T = TypeVar("T")
 CONTROLS = ("least_squares_f", "hac_f", "stepwise_bic", "lasso", "boosted_trees")
 
 
@@ -130,6 +132,16 @@ def run_engine(
         gain_ratio=(measured.ratio, *measured.ci95),
         gain_score=(measured.log_score, *measured.log_score_ci95),
     )
+
+
+def oracle_kind(case: Case) -> tuple[str, str]:
+    """The noise of a case with nothing hidden, and what an oracle takes it for that knows how levels are drawn."""
+    built = build(case)
+    design = built.design
+    data = np.deg2rad(built.columns["output"]) - design.true["rate"]
+    fixed = np.column_stack([error(name, design, 1.0, {}) for name in built.truth.baseline])
+    shares = kind_shares(data, design, fixed)
+    return case.noise, max(shares, key=shares.__getitem__)
 
 
 def settled(built: Built, campaign: Any, model: Any, asked: str | None) -> tuple[str, ...] | None:
@@ -285,14 +297,18 @@ def _in_turn(
 
 
 def run_cases(cases: list[Case], workers: int = 1, **options: Any) -> list[Record]:
-    """Run cases, in fresh processes when there are several workers (JAX does not fork)."""
+    """Run cases, each with the options of `run_case`."""
+    return in_processes(partial(run_case, **options), cases, workers)
+
+
+def in_processes(function: Callable[[Case], T], cases: list[Case], workers: int) -> list[T]:
+    """What a function makes of each case, in fresh processes when there are several workers (JAX does not fork)."""
     if workers == 1:
-        return [run_case(case, **options) for case in cases]
+        return [function(case) for case in cases]
     # Read by the new processes, which would fight for the cores.
     os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        futures = [pool.submit(run_case, case, **options) for case in cases]
-        return [f.result() for f in futures]
+        return list(pool.map(function, cases))
 
 
 @dataclass(frozen=True)
