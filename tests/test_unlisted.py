@@ -53,3 +53,33 @@ def test_a_scale_factor_that_warms_up_follows_rate_and_time(rng: np.random.Gener
     assert found.verdict == "unknown"
     assert found.driver is not None
     assert found.driver.column == "rate and time"
+
+
+def chamber(rng: np.random.Generator) -> np.ndarray:
+    """What a gyro in a chamber has of four ramps, each of a speed of its own, with soaks between."""
+    times = np.concatenate([[0.0], np.cumsum(rng.uniform(0.5, 1.5, 9))])
+    levels = np.array([0.1, 0.1, 1.0, 1.0, 0.0, 0.0, 0.8, 0.8, 0.3, 0.3])
+    return leaked(np.interp(TIME, TIME[-1] * times / times[-1], -10.0 + 60.0 * levels), STEP, 300.0)
+
+
+@pytest.mark.parametrize("periods", [3.0, 7.5, 12.0])
+def test_a_ripple_over_temperature_is_told_of_however_fine(periods: float, rng: np.random.Generator):
+    """Parasitic interference: fringes that pass as a light path expands, of 40 standard deviations together."""
+    inside = chamber(rng)
+    fringes = np.sin(2 * np.pi * periods * (inside - inside.min()) / np.ptp(inside) + rng.uniform(0.0, 6.0))
+    measured = log(0.5 + 0.08 * fringes, rng, temperature=inside + 0.01 * rng.standard_normal(len(TIME)))
+    found = gm.diagnose(measured, gm.model_from_effects(["bias"]), hold_out=False)
+    assert found.verdict == "unknown"
+    assert found.driver is not None
+    assert found.driver.column == "temperature"
+
+
+def test_a_ripple_over_the_temperature_of_a_buried_place_follows_what_was_before(rng: np.random.Generator):
+    inside = chamber(rng)
+    buried = leaked(inside, STEP, rng.uniform(400.0, 1200.0))
+    fringes = np.sin(2 * np.pi * 2.6 * (buried - buried.min()) / np.ptp(buried) + rng.uniform(0.0, 6.0))
+    measured = log(0.5 + 0.08 * fringes, rng, temperature=inside + 0.01 * rng.standard_normal(len(TIME)))
+    found = gm.diagnose(measured, gm.model_from_effects(["bias"]), hold_out=False)
+    assert found.verdict == "unknown"
+    assert found.driver is not None
+    assert found.driver.column == "temperature[earlier]"

@@ -17,14 +17,14 @@ from gyromodel.declarations import EARLIER, RATE_OF, measured
 from gyromodel.signals import Record, thermometer_rate
 from gyromodel.units import is_angle
 
-# Length scales of the smooth functions, as parts of the driver's range.
-SMOOTH_SCALES = (0.08, 0.2, 0.5)
+# Length scales of the smooth functions, as parts of the driver's range; and of ripples over a measured column.
+SMOOTH_SCALES, RIPPLE = (0.08, 0.2, 0.5), 0.03
 PAIR_SCALES = (0.25, 0.6)
 # Rates crowd where their order places one this far, of the whole range, from where its value does.
 CROWDED = 0.1
 # A column has a past worth looking at if its steps from row to row are this small beside its own variation; through how
 # long a lag what remembers it follows, as parts of a run, and as how smooth a function.
-SLOW, LAGS, PAST_SCALES = 0.05, (0.01, 0.02, 0.04, 0.08, 0.16), (0.2, 0.5)
+SLOW, LAGS = 0.05, tuple(0.01 * 2.0 ** (k / 2) for k in range(9))
 # Samples before and after, whose rates stand for a linear response of any form (those after for its smooth part at the
 # ends of a run), and the least part of steps at which rates move.
 RESPONSE, MOVING = (13, 5, 2, 1, -1, -2), 0.5
@@ -77,7 +77,8 @@ def smooths(record: Record) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Name, values of the first column, and columns of each smooth function, one a length scale."""
     names = driver_names(record)
     for name in (*names, "time"):
-        yield from _of_one(record, f"smooth({name})", np.asarray(record.signals[name]))
+        scales = SMOOTH_SCALES if name == "time" else (RIPPLE, *SMOOTH_SCALES)
+        yield from _of_one(record, f"smooth({name})", np.asarray(record.signals[name]), scales)
     if "rate" in names and (places := _places(record)) is not None:
         yield "smooth(rate)", np.asarray(record.signals["rate"]), _bumps(record, places, SMOOTH_SCALES[0])
     if record.domain == "gyro" and "rate" in names:
@@ -229,9 +230,11 @@ def _history(record: Record, name: str) -> Iterator[tuple[str, np.ndarray, tuple
         yield RATE_OF.format(name), np.pad(rate, extra, mode="edge"), SMOOTH_SCALES
     runs = _runs(record)
     span = max(float(np.ptp(time[rows])) for rows in runs)
-    for lag in LAGS:
+    for k, lag in enumerate(LAGS):
         late = np.concatenate([_followed(time[rows], values[rows], lag * span) for rows in runs])
-        yield EARLIER.format(name), np.pad(late, extra, mode="edge"), PAST_SCALES
+        # What varies over a large part of the range tells every second lag from the next.
+        scales = SMOOTH_SCALES if k % 2 == 0 else SMOOTH_SCALES[:1]
+        yield EARLIER.format(name), np.pad(late, extra, mode="edge"), scales
 
 
 def _followed(time: np.ndarray, values: np.ndarray, time_constant: float) -> np.ndarray:
