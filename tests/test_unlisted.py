@@ -83,3 +83,51 @@ def test_a_ripple_over_the_temperature_of_a_buried_place_follows_what_was_before
     assert found.verdict == "unknown"
     assert found.driver is not None
     assert found.driver.column == "temperature[earlier]"
+
+
+def table(rng: np.random.Generator) -> np.ndarray:
+    """Rates of a table in random order, 80 of 15 dwells each, in deg/s."""
+    return np.repeat(rng.permutation(np.repeat(np.linspace(-100.0, 100.0, 16), 5)), 15)
+
+
+@pytest.mark.parametrize("at", [0.35, 0.6])
+def test_a_level_that_switches_with_temperature_follows_temperature(at: float, rng: np.random.Generator):
+    """A laser that hops between two modes: several steps in time, one cause."""
+    inside = chamber(rng)
+    hop = inside > inside.min() + at * np.ptp(inside)
+    measured = log(0.5 + 0.1 * hop, rng, temperature=inside + 0.01 * rng.standard_normal(len(TIME)))
+    found = gm.diagnose(measured, gm.model_from_effects(["bias"]), hold_out=False)
+    assert found.verdict == "unknown"
+    assert found.driver is not None
+    assert found.driver.column == "temperature"
+
+
+def test_the_heat_of_a_torquer_follows_what_the_rate_was(rng: np.random.Generator):
+    """A bias over a temperature that nobody measures, which the square of the rate raises."""
+    rate = table(rng)
+    warm = leaked((rate / 100.0) ** 2, STEP, rng.uniform(500.0, 1500.0))
+    measured = log(3600.0 * rate + 0.5 + 0.9 * warm, rng, rate=rate, temperature=chamber(rng))
+    found = gm.diagnose(measured, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
+    assert found.verdict == "unknown"
+    assert found.driver is not None
+    assert found.driver.column == "rate[earlier]"
+
+
+@pytest.mark.parametrize(
+    ("change", "driver"),
+    [("jump", "rate and time"), ("ripple", "rate and temperature"), ("buried", "rate and temperature[earlier]")],
+)
+def test_scale_factors_that_jump_ripple_or_lag_follow_what_they_do(change: str, driver: str, rng: np.random.Generator):
+    rate, inside = table(rng), chamber(rng)
+    part = (inside - inside.min()) / np.ptp(inside)
+    changes = {
+        "jump": 1.0 * (TIME > rng.uniform(0.3, 0.7) * TIME[-1]),
+        "ripple": np.sin(2 * np.pi * 3.5 * part + rng.uniform(0.0, 6.0)),
+        "buried": leaked(part, STEP, rng.uniform(700.0, 1500.0)),
+    }
+    output = 3600.0 * rate * (1.0 + 1e-6 * changes[change]) + 0.5
+    measured = log(output, rng, rate=rate, temperature=inside + 0.01 * rng.standard_normal(len(TIME)))
+    found = gm.diagnose(measured, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
+    assert found.verdict == "unknown"
+    assert found.driver is not None
+    assert found.driver.column == driver

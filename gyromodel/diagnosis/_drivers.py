@@ -20,6 +20,11 @@ from gyromodel.units import is_angle
 # Length scales of the smooth functions, as parts of the driver's range; and of ripples over a measured column.
 SMOOTH_SCALES, RIPPLE = (0.08, 0.2, 0.5), 0.03
 PAIR_SCALES = (0.25, 0.6)
+# Thresholds of a column at which something may switch: as many, with as many samples between; less those that a column
+# crosses about once, of which this part of the variance or more is a step's in time.
+THRESHOLDS, ONE_STEP = 63, 0.9
+# Samples that something warms up in, at the least: from row to row of a table it would be a curve over the rate.
+WARMING = 4
 # Rates crowd where their order places one this far, of the whole range, from where its value does.
 CROWDED = 0.1
 # A column has a past worth looking at if its steps from row to row are this small beside its own variation; through how
@@ -79,18 +84,25 @@ def smooths(record: Record) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     for name in (*names, "time"):
         scales = SMOOTH_SCALES if name == "time" else (RIPPLE, *SMOOTH_SCALES)
         yield from _of_one(record, f"smooth({name})", np.asarray(record.signals[name]), scales)
+        if name not in ("rate", "time", "campaign"):
+            yield from _switches(record, name)
     if "rate" in names and (places := _places(record)) is not None:
         yield "smooth(rate)", np.asarray(record.signals["rate"]), _bumps(record, places, SMOOTH_SCALES[0])
     if record.domain == "gyro" and "rate" in names:
         yield from _response(record)
+        yield from _heated(record)
     for name in (n for n in names if n not in ("rate", "campaign") and _slow(record, n)):
         if is_angle(record.units[name]):
             continue  # it may wrap round, which is no rate of change
         for derived, values, scales in _history(record, name):
             yield from _of_one(record, f"smooth({derived})", values, scales)
-            # In proportion to it, with no more of a shape; what follows a thermometer so is in the catalogue.
+            # In proportion to it, with no more of a shape; what follows a thermometer so is in the catalogue, but for
+            # scale factors.
             if _kind(record, name) != "temperature":
                 yield f"smooth({derived})", values, _product(record, values)
+            elif "rate" in names and derived == EARLIER.format(name):
+                rate = np.asarray(record.signals["rate"])
+                yield f"smooth(rate, {derived})", rate, _product(record, rate, values)
     # What repeats with an oscillation is a function of its angle and rate.
     paired = ("rate", "temperature") if record.domain == "gyro" else ("table", "table_rate")
     rate_first = sorted(names, key=lambda n: n not in paired)[: 3 if record.domain == "gyro" else 2]
@@ -102,6 +114,10 @@ def smooths(record: Record) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
             for scale in PAIR_SCALES:
                 of_x, of_y = _bumps(record, x, scale), _bumps(record, y, scale)
                 yield f"smooth({a}, {b})", x, (of_x[:, :, None] * of_y[:, None, :]).reshape(len(x), -1)
+            if a == "rate":  # a scale factor that ripples, or jumps
+                yield f"smooth({a}, {b})", x, x[:, None] * _bumps(record, y, SMOOTH_SCALES[0])
+            if b == "time":
+                yield from ((f"smooth({a}, {b})", x, _product(record, x, above)) for above in _levels(record, y))
 
 
 def products(record: Record, known: Container[str]) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
@@ -163,6 +179,44 @@ def _bumps(record: Record, values: np.ndarray, scale: float) -> np.ndarray:
     centres = np.linspace(0.0, 1.0, round(1.0 / scale) + 1)
     part = (values - inside.min()) / np.ptp(inside)
     return np.exp(-0.5 * ((part[:, None] - centres) / scale) ** 2)
+
+
+def _switches(record: Record, name: str) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Two levels, one on either side of a threshold of a column, as a laser's mode or a converter's range has them."""
+    values = np.asarray(record.signals[name])
+    for above in _levels(record, values):
+        if _as_one_step(above[: record.rows][record.present]) < ONE_STEP:
+            yield f"smooth({name})", values, above[:, None]
+
+
+def _levels(record: Record, values: np.ndarray) -> Iterator[np.ndarray]:
+    """Whether a column is above a threshold, for some that part its samples evenly."""
+    inside = values[: record.rows][record.present]
+    for threshold in np.unique(np.quantile(inside, np.arange(1, THRESHOLDS + 1) / (THRESHOLDS + 1))):
+        yield (values > threshold).astype(float)
+
+
+def _as_one_step(values: np.ndarray) -> float:
+    """The largest part of the variance that one step explains; all of what does not vary."""
+    n, rest = len(values), values - values.mean()
+    before = np.arange(1, n)
+    explained = np.cumsum(rest)[:-1] ** 2 * n / (before * (n - before))
+    return float(explained.max() / (rest @ rest)) if rest @ rest > 0 else 1.0
+
+
+def _heated(record: Record) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """The rate's power through lags, as a root mean square and as it is: what a torquer or a motor warms."""
+    runs, extra = _runs(record), (0, len(record.signals["time"]) - record.rows)
+    time, rate = (np.asarray(record.signals[n])[: record.rows] for n in ("time", "rate"))
+    for lag in (lag for lag in _lags(time, runs) if lag > WARMING * record.interval):
+        power = np.concatenate([_followed(time[rows], rate[rows] ** 2, lag) for rows in runs])
+        power = np.pad(power, extra, mode="edge")
+        yield f"smooth({EARLIER.format('rate')})", np.sqrt(power), _product(record, power)
+
+
+def _lags(time: np.ndarray, runs: list[np.ndarray]) -> list[float]:
+    span = max(float(np.ptp(time[rows])) for rows in runs)
+    return [lag * span for lag in LAGS]
 
 
 def _places(record: Record) -> np.ndarray | None:
@@ -229,9 +283,8 @@ def _history(record: Record, name: str) -> Iterator[tuple[str, np.ndarray, tuple
     if np.isfinite(rate).all() and np.ptp(rate) > 0:
         yield RATE_OF.format(name), np.pad(rate, extra, mode="edge"), SMOOTH_SCALES
     runs = _runs(record)
-    span = max(float(np.ptp(time[rows])) for rows in runs)
-    for k, lag in enumerate(LAGS):
-        late = np.concatenate([_followed(time[rows], values[rows], lag * span) for rows in runs])
+    for k, lag in enumerate(_lags(time, runs)):
+        late = np.concatenate([_followed(time[rows], values[rows], lag) for rows in runs])
         # What varies over a large part of the range tells every second lag from the next.
         scales = SMOOTH_SCALES if k % 2 == 0 else SMOOTH_SCALES[:1]
         yield EARLIER.format(name), np.pad(late, extra, mode="edge"), scales

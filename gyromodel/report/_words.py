@@ -99,6 +99,8 @@ def _driven(column: str) -> str:
     base, form = measured(column)
     if (base, form) == ("rate", RATE_OF):
         return "angular acceleration"
+    if (base, form) == ("rate", EARLIER):
+        return "the root mean square of the rate some time before"
     after = {RATE_OF: " rate", EARLIER: " some time before"}.get(form, "")
     return _DRIVERS.get(base, spoken(base)) + after
 
