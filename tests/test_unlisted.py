@@ -119,9 +119,9 @@ def test_the_heat_of_a_torquer_follows_what_the_rate_was(rng: np.random.Generato
 )
 def test_scale_factors_that_jump_ripple_or_lag_follow_what_they_do(change: str, driver: str, rng: np.random.Generator):
     rate, inside = table(rng), chamber(rng)
-    part = (inside - inside.min()) / np.ptp(inside)
+    part, jump = (inside - inside.min()) / np.ptp(inside), rng.uniform(0.3, 0.7) * TIME[-1]
     changes = {
-        "jump": 1.0 * (TIME > rng.uniform(0.3, 0.7) * TIME[-1]),
+        "jump": 1.0 * (jump < TIME),
         "ripple": np.sin(2 * np.pi * 3.5 * part + rng.uniform(0.0, 6.0)),
         "buried": leaked(part, STEP, rng.uniform(700.0, 1500.0)),
     }
