@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array
 
 from gyromodel._checks import of_usual_unit, usual_unit
-from gyromodel.diagnosis._drivers import driver_names, is_no_driver, products, smooths, unusable
+from gyromodel.diagnosis._drivers import driver_names, is_no_driver, unusable
+from gyromodel.diagnosis._smooths import products, smooths
 from gyromodel.effects import CATALOGUE, Effect, Signals
 from gyromodel.effects._base import lacking
 from gyromodel.effects.drivers import BiasColumn
