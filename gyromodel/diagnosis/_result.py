@@ -95,9 +95,9 @@ class Gain:
 class Driver:
     """The smooth function of one column (or of time) that an unknown discrepancy follows, with its standard error.
 
-    `column` is a column a, d(a)/dt (its rate of change) or a[earlier] (its value some time before). `nearest` is the
-    catalogue effect that comes closest, `nearest_share` what part of the curve's work it does, `behind` by how many
-    nats of evidence it is beaten.
+    `column` is a column a, d(a)/dt (its rate of change), a[earlier] (its value some time before) or rate[earlier] (the
+    root mean square of the rate some time before, which warms a torquer). `nearest` is the catalogue effect that comes
+    closest, `nearest_share` what part of the curve's work it does, `behind` by how many nats of evidence it is beaten.
     """
 
     column: str

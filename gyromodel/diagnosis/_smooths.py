@@ -20,7 +20,7 @@ PAIR_SCALES = (0.25, 0.6)
 # Thresholds of a column at which something may switch: as many, with as many samples between; less those that a column
 # crosses about once, of which this part of the variance or more is a step's in time.
 THRESHOLDS, ONE_STEP = 63, 0.9
-# Samples that something warms up in, at the least: from row to row of a table it would be a curve over the rate.
+# Samples in which a torquer warms up, at the least: from row to row of a table it would be a curve over the rate.
 WARMING = 4
 # Rates crowd where their order places one this far, of the whole range, from where its value does.
 CROWDED = 0.1
