@@ -131,3 +131,27 @@ def test_scale_factors_that_jump_ripple_or_lag_follow_what_they_do(change: str, 
     assert found.verdict == "unknown"
     assert found.driver is not None
     assert found.driver.column == driver
+
+
+@pytest.mark.parametrize(
+    ("error", "driver"), [("rectified", {"d(rate)/dt"}), ("cross product", {"rate_output", "rate_spin"})]
+)
+def test_what_a_moving_rate_does_otherwise_than_in_proportion(error: str, driver: set[str], rng: np.random.Generator):
+    """A rectified angular acceleration, and the rates about two other axes: of 30 standard deviations together."""
+    time = 0.01 * np.arange(1200)
+    f, phase = rng.uniform(0.3, 4.0, (3, 4)), rng.uniform(0.0, 6.0, (3, 4))
+    rate, across, along = np.sin(2 * np.pi * f[..., None] * time + phase[..., None]).sum(axis=1)
+    w = 2 * np.pi * f[0, :, None]
+    wrong = {
+        "rectified": np.abs((w * np.cos(w * time + phase[0, :, None])).sum(axis=0)),
+        "cross product": across * along,
+    }
+    shape = wrong[error] - wrong[error].mean()
+    output = rate + 0.01 * (shape / shape.std() * 30.0 / np.sqrt(len(time)) + rng.standard_normal(len(time)))
+    columns = {"time": time, "rate": rate, "rate_output": across, "rate_spin": along, "output": output}
+    units = {name: "s" if name == "time" else "deg/s" for name in columns}
+    measured = gm.Campaign(columns, units, {"kind": "rate"})
+    found = gm.diagnose(measured, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
+    assert found.verdict == "unknown"
+    assert found.driver is not None
+    assert set(found.driver.column.split(" and ")) == driver

@@ -22,6 +22,8 @@ PAIR_SCALES = (0.25, 0.6)
 THRESHOLDS, ONE_STEP = 63, 0.9
 # Samples in which a torquer warms up, at the least: from row to row of a table it would be a curve over the rate.
 WARMING = 4
+# Columns of one kind whose product no effect holds.
+UNLIKE = {"rate", "rate_output"}, {"rate_output", "rate_spin"}
 # Rates crowd where their order places one this far, of the whole range, from where its value does.
 CROWDED = 0.1
 # A column has a past worth looking at if its steps from row to row are this small beside its own variation; through how
@@ -96,7 +98,7 @@ def products(record: Record, known: Container[str]) -> Iterator[Smooth]:
     names = [n for n in driver_names(record) if n != "campaign"] if record.domain == "gyro" else []
     names = sorted(names, key=lambda n: n not in ("rate", "temperature"))
     for a, b in combinations(names, 2):
-        alike = kind_of(record, a) == kind_of(record, b) and {a, b} - {"rate", "rate_output"}
+        alike = kind_of(record, a) == kind_of(record, b) and {a, b} not in UNLIKE
         if alike or (a not in ("rate", "temperature") and (is_angle(record.units[a]) or is_angle(record.units[b]))):
             continue
         if f"smooth({a}, {b})" not in known and f"smooth({b}, {a})" not in known:
@@ -186,7 +188,7 @@ def _slow(record: Record, name: str) -> bool:
 
 
 def _response(record: Record) -> Iterator[Smooth]:
-    """Any linear response to a moving rate: its values some samples before and after, over its rate of change."""
+    """Responses to a moving rate over its rate of change: any linear one by values some samples before and after."""
     rate, time = (np.asarray(record.signals[n])[: record.rows] for n in ("rate", "time"))
     runs, most = _turning(record), max(RESPONSE)
     if not runs:
@@ -200,7 +202,10 @@ def _response(record: Record) -> Iterator[Smooth]:
     # Of columns so much alike only what is left of each beside those before can be weighed.
     inside = np.column_stack([np.ones(record.rows), rate, before[: record.rows]])
     before[: record.rows] = np.linalg.qr(inside)[0][:, 2:]
-    yield RESPONSE_DRIVER, _acceleration(record, runs), before
+    acceleration = _acceleration(record, runs)
+    yield RESPONSE_DRIVER, acceleration, before
+    # And what is no linear response, such as friction's sign.
+    yield from _of_one(record, RESPONSE_DRIVER, acceleration)
 
 
 def _turning(record: Record) -> list[np.ndarray]:
