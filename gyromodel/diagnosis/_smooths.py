@@ -17,6 +17,9 @@ Smooth = tuple[str, np.ndarray, np.ndarray]
 # Length scales of the smooth functions, as parts of the driver's range; and of ripples over a measured column.
 SMOOTH_SCALES, RIPPLE = (0.08, 0.2, 0.5), 0.03
 PAIR_SCALES = (0.25, 0.6)
+# Periods over a slow column's range of what repeats along it, more often than those ripples can; less those whose phase
+# departs less (rad) from a straight line in time: they are lines.
+PERIODS, STRAIGHT = tuple(np.arange(10.0, 60.5, 0.5)), 1.0
 # Thresholds of a column at which something may switch: as many, with as many samples between; less those that a column
 # crosses about once, of which this part of the variance or more is a step's in time.
 THRESHOLDS, ONE_STEP = 63, 0.9
@@ -42,7 +45,8 @@ def smooths(record: Record) -> Iterator[Smooth]:
         yield from _response(record)
         yield from _heated(record)
     for name in (n for n in names if n not in ("rate", "campaign") and _slow(record, n)):
-        if not is_angle(record.units[name]):  # it may wrap round, which is no rate of change
+        if not is_angle(record.units[name]):  # it may wrap round, which is no rate of change; its harmonics have names
+            yield from _periodic(record, name)
             yield from _remembered(record, name, names)
     yield from _paired(record, names)
 
@@ -127,6 +131,17 @@ def _bumps(record: Record, values: np.ndarray, scale: float) -> np.ndarray:
     centres = np.linspace(0.0, 1.0, round(1.0 / scale) + 1)
     part = (values - inside.min()) / np.ptp(inside)
     return np.exp(-0.5 * ((part[:, None] - centres) / scale) ** 2)
+
+
+def _periodic(record: Record, name: str) -> Iterator[Smooth]:
+    """A sine along a column, as light that interferes with itself makes it; in time, it passes for lines."""
+    values = np.asarray(record.signals[name])
+    inside, time = values[: record.rows], np.asarray(record.signals["time"])
+    trends = [(rows, np.polyfit(time[rows], inside[rows], min(1, len(rows) - 1))) for rows in _runs(record)]
+    departs = np.sqrt(sum(np.sum((inside[r] - np.polyval(line, time[r])) ** 2) for r, line in trends) / record.rows)
+    for turn in 2.0 * np.pi * np.array(PERIODS) / np.ptp(inside):
+        if turn * departs > STRAIGHT:
+            yield f"smooth({name})", values, np.column_stack([np.cos(turn * values), np.sin(turn * values)])
 
 
 def _switches(record: Record, name: str) -> Iterator[Smooth]:
