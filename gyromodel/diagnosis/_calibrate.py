@@ -131,7 +131,7 @@ def _significance(scanner: Scanner, cells: Sequence[int], batches: Sequence[Batc
         each.append(evidence)
         more.append(needed)
     if {"bias_periodic", RESPONSE_DRIVER} <= set(names):
-        # Lines that any response to the motion explains better are not what a search would add (`Ranking.best`).
+        # Lines that a response to the motion explains better are not what a search would add (`Ranking.best`).
         line = names.index("bias_periodic")
         each[line] = np.where(each[names.index(RESPONSE_DRIVER)] > each[line], -np.inf, each[line])
     drivers = np.array([is_driver(name) for name in names])

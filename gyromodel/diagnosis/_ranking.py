@@ -59,7 +59,7 @@ class Ranking:
     def best(self, *, drivers: bool, but: tuple[str, ...] = ()) -> tuple[str | None, float]:
         """The best unknown driver, or the best named candidate (but some), and its evidence ratio (ln).
 
-        Lines that any response to the motion explains better are the motion's own.
+        Lines that a response to the motion, linear or not, explains better are the motion's own.
         """
         if self.statistic.get(RESPONSE_DRIVER, -np.inf) > self.statistic.get("bias_periodic", -np.inf):
             but = (*but, "bias_periodic")

@@ -17,14 +17,16 @@ Smooth = tuple[str, np.ndarray, np.ndarray]
 # Length scales of the smooth functions, as parts of the driver's range; and of ripples over a measured column.
 SMOOTH_SCALES, RIPPLE = (0.08, 0.2, 0.5), 0.03
 PAIR_SCALES = (0.25, 0.6)
-# Periods over a slow column's range of what repeats along it, more often than those ripples can; less those whose phase
-# departs less (rad) from a straight line in time: they are lines.
-PERIODS, STRAIGHT = tuple(np.arange(10.0, 60.5, 0.5)), 1.0
+# Periods over a slow column's range of what repeats along it, more often than those ripples can, if it is among as many
+# first ones; less those whose phase departs less (rad) from a straight line in time: they are lines.
+PERIODS, SWEPT, STRAIGHT = tuple(np.arange(10.0, 60.5, 0.5)), 3, 1.0
 # Thresholds of a column at which something may switch: as many, with as many samples between; less those that a column
 # crosses about once, of which this part of the variance or more is a step's in time.
 THRESHOLDS, ONE_STEP = 63, 0.9
 # Samples in which a torquer warms up, at the least: from row to row of a table it would be a curve over the rate.
 WARMING = 4
+# A thermometer of which the rate's power explains this part, but for noise, measures what the rate warms.
+WARMED = 0.9
 # Columns of one kind whose product no effect holds.
 UNLIKE = {"rate", "rate_output"}, {"rate_output", "rate_spin"}
 # Rates crowd where their order places one this far, of the whole range, from where its value does.
@@ -39,16 +41,23 @@ RESPONSE, MOVING = (13, 5, 2, 1, -1, -2), 0.5
 
 def smooths(record: Record) -> Iterator[Smooth]:
     """Name, values of the first column, and columns of each smooth function, one a length scale."""
-    names = driver_names(record)
+    names = _ordered(record)
     yield from _alone(record, names)
     if record.domain == "gyro" and "rate" in names:
         yield from _response(record)
         yield from _heated(record)
     for name in (n for n in names if n not in ("rate", "campaign") and _slow(record, n)):
         if not is_angle(record.units[name]):  # it may wrap round, which is no rate of change; its harmonics have names
-            yield from _periodic(record, name)
+            if name in names[:SWEPT]:
+                yield from _periodic(record, name)
             yield from _remembered(record, name, names)
     yield from _paired(record, names)
+
+
+def _ordered(record: Record) -> list[str]:
+    """Measured columns that vary, those that matter most first: what repeats with an oscillation follows its angle."""
+    first = ("rate", "temperature") if record.domain == "gyro" else ("table", "table_rate")
+    return sorted(driver_names(record), key=lambda n: first.index(n) if n in first else len(first))
 
 
 def _alone(record: Record, names: Sequence[str]) -> Iterator[Smooth]:
@@ -76,10 +85,8 @@ def _remembered(record: Record, name: str, names: Sequence[str]) -> Iterator[Smo
 
 def _paired(record: Record, names: Sequence[str]) -> Iterator[Smooth]:
     """Functions of two columns, those that matter most first; of the rate and time, too."""
-    # What repeats with an oscillation is a function of its angle and rate.
     gyro = record.domain == "gyro"
-    first = ("rate", "temperature") if gyro else ("table", "table_rate")
-    few = sorted(names, key=lambda n: n not in first)[: 3 if gyro else 2]
+    few = names[: 3 if gyro else 2]
     pairs = [*combinations(few, 2), *([("rate", "time")] if gyro and "rate" in names else [])]
     for a, b in pairs:
         x, y = (np.asarray(record.signals[n]) for n in (a, b))
@@ -99,8 +106,7 @@ def products(record: Record, known: Container[str]) -> Iterator[Smooth]:
     effect becomes whose size follows another column, such as a mass unbalance that changes with temperature. Columns of
     one kind have effects of their own.
     """
-    names = [n for n in driver_names(record) if n != "campaign"] if record.domain == "gyro" else []
-    names = sorted(names, key=lambda n: n not in ("rate", "temperature"))
+    names = [n for n in _ordered(record) if n != "campaign"] if record.domain == "gyro" else []
     for a, b in combinations(names, 2):
         alike = kind_of(record, a) == kind_of(record, b) and {a, b} not in UNLIKE
         if alike or (a not in ("rate", "temperature") and (is_angle(record.units[a]) or is_angle(record.units[b]))):
@@ -168,13 +174,26 @@ def _as_one_step(values: np.ndarray) -> float:
 
 
 def _heated(record: Record) -> Iterator[Smooth]:
-    """The rate's power through lags, as a root mean square and as it is: what a torquer or a motor warms."""
+    """The rate's power through lags, as a root mean square and as it is: what a torquer or a motor warms.
+
+    None where a thermometer measures it: beside its noise, what is computed would stand for what it shows.
+    """
     runs, extra = _runs(record), (0, len(record.signals["time"]) - record.rows)
     time, rate = (np.asarray(record.signals[n])[: record.rows] for n in ("time", "rate"))
-    for lag in (lag for lag in _lags(time, runs) if lag > WARMING * record.interval):
-        power = np.concatenate([_followed(time[rows], rate[rows] ** 2, lag) for rows in runs])
-        power = np.pad(power, extra, mode="edge")
+    lags = [lag for lag in _lags(time, runs) if lag > WARMING * record.interval]
+    powers = [np.concatenate([_followed(time[rows], rate[rows] ** 2, lag) for rows in runs]) for lag in lags]
+    if any(_measures(record, name, power) for name in driver_names(record) for power in powers):
+        return
+    for power in (np.pad(p, extra, mode="edge") for p in powers):
         yield f"smooth({EARLIER.format('rate')})", np.sqrt(power), _product(record, power)
+
+
+def _measures(record: Record, name: str, values: np.ndarray) -> bool:
+    """Whether a thermometer shows some values and its noise, which second differences tell."""
+    shown = np.asarray(record.signals[name])[: record.rows]
+    own = np.var(shown) - np.mean(np.diff(shown, 2) ** 2) / 6.0
+    covariance = np.mean((shown - shown.mean()) * (values - values.mean()))
+    return kind_of(record, name) == "temperature" and covariance**2 > WARMED * own * np.var(values)
 
 
 def _lags(time: np.ndarray, runs: list[np.ndarray]) -> list[float]:
