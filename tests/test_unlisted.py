@@ -22,7 +22,7 @@ def log(output: np.ndarray, rng: np.random.Generator, **columns: np.ndarray) -> 
 def followed(measured: gm.Campaign, *simulated: str) -> str | None:
     """The columns that an unknown discrepancy follows, under a simulation with a bias and these effects."""
     found = gm.diagnose(measured, gm.model_from_effects(["bias", *simulated]), hold_out=False)
-    assert found.verdict == "unknown"
+    assert (found.verdict, found.causes) == ("unknown", ())
     return found.driver and found.driver.column
 
 
@@ -123,6 +123,26 @@ def test_the_heat_of_a_torquer_follows_what_the_rate_was(rng: np.random.Generato
     assert followed(measured, "scale_factor") == "rate[earlier]"
 
 
+@pytest.mark.parametrize("noise", [0.005, 0.02])
+def test_a_measured_heat_of_a_torquer_is_temperature(noise: float, rng: np.random.Generator):
+    """400 standard deviations of a bias over temperature, which a computed heat would follow without the noise."""
+    rate = table(rng)
+    warm = leaked((rate / 100.0) ** 2, STEP, rng.uniform(500.0, 2000.0))
+    measured = log(3600.0 * rate + 0.5 + 400.0 * 0.05 / np.linalg.norm(warm - warm.mean()) * warm, rng,
+                   rate=rate, temperature=25.0 + 8.0 * warm + noise * rng.standard_normal(len(TIME)))  # fmt: skip
+    found = gm.diagnose(measured, gm.model_from_effects(["bias", "scale_factor"]), hold_out=False)
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["bias_temperature"])
+
+
+def test_a_large_warm_up_beside_a_rising_temperature_is_no_curve(rng: np.random.Generator):
+    """A curve over the temperature has nearly its form, and more coefficients than its time constant is worth."""
+    warming = np.exp(-TIME / rng.uniform(1200.0, 3500.0))
+    rising = 40.0 - 15.0 * np.exp(-TIME / 5000.0) + 0.02 * rng.standard_normal(len(TIME))
+    output = 400.0 * 0.05 / np.linalg.norm(warming - warming.mean()) * warming
+    found = gm.diagnose(log(output, rng, temperature=rising), gm.model_from_effects(["bias"]), hold_out=False)
+    assert "bias_warmup" in found.credible_set
+
+
 @pytest.mark.parametrize(
     ("change", "driver"),
     [("jump", "rate and time"), ("ripple", "rate and temperature"), ("buried", "rate and temperature[earlier]")],
@@ -136,7 +156,8 @@ def test_scale_factors_that_jump_ripple_or_lag_follow_what_they_do(change: str, 
         "buried": leaked(part, STEP, rng.uniform(700.0, 1500.0)),
     }
     output = 3600.0 * rate * (1.0 + 1e-6 * changes[change]) + 0.5
-    measured = log(output, rng, rate=rate, temperature=inside + 0.01 * rng.standard_normal(len(TIME)))
+    columns = {"rate": rate, "temperature": inside + 0.01 * rng.standard_normal(len(TIME))}
+    measured = log(output, rng, **{name: columns[name] for name in rng.permutation([*columns])})
     assert followed(measured, "scale_factor") == driver
 
 

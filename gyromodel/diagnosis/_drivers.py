@@ -1,7 +1,7 @@
 """What an unknown discrepancy may follow: columns, their rates, what they were before, and time; and its name.
 
 A driver's name is "smooth(a)" or "smooth(a, b)"; d(a)/dt stands for the rate of column a, a[earlier] for what follows
-it some time later: its value, or of the rate its power.
+it some time later: its value, or of the rate its root mean square.
 """
 
 from __future__ import annotations

@@ -193,7 +193,7 @@ def _measures(record: Record, name: str, values: np.ndarray) -> bool:
     shown = np.asarray(record.signals[name])[: record.rows]
     own = np.var(shown) - np.mean(np.diff(shown, 2) ** 2) / 6.0
     covariance = np.mean((shown - shown.mean()) * (values - values.mean()))
-    return kind_of(record, name) == "temperature" and covariance**2 > WARMED * own * np.var(values)
+    return bool(kind_of(record, name) == "temperature" and covariance**2 > WARMED * own * np.var(values))
 
 
 def _lags(time: np.ndarray, runs: list[np.ndarray]) -> list[float]:

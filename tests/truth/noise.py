@@ -182,7 +182,7 @@ def draw(kind: str, design: Design, rng: np.random.Generator) -> Noise:
 
 
 def kind_shares(data: Array, design: Design, fixed: Array) -> dict[str, float]:
-    """Share of the posterior of each kind of the family: what an oracle can tell that knows how `draw` draws.
+    """Share of the posterior of each kind of the family: what an oracle can tell that knows how `draw` draws colour.
 
     All kinds are as likely, and their crossings have the law of `draw`; the white level (any, log-uniform) and the
     coefficients of the columns of `fixed` are integrated out in closed form.
@@ -199,13 +199,10 @@ def kind_shares(data: Array, design: Design, fixed: Array) -> dict[str, float]:
         "random_walk": (white + w for w in walk),
         "flicker_and_walk": (white + f + w for f in flicker for w in walk),
     }
-    scores = {kind: _mean_evidence([_evidence(data, V, fixed) for V in each]) for kind, each in covariances.items()}
+    each = {kind: [_evidence(data, V, fixed) for V in all_of] for kind, all_of in covariances.items()}
+    scores = {kind: float(logsumexp(values) - np.log(len(values))) for kind, values in each.items()}
     total = logsumexp(list(scores.values()))
     return {kind: float(np.exp(score - total)) for kind, score in scores.items()}
-
-
-def _mean_evidence(values: list[float]) -> float:
-    return float(logsumexp(values) - np.log(len(values)))
 
 
 def _evidence(data: Array, covariance: Array, fixed: Array) -> float:
