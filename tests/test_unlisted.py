@@ -48,6 +48,7 @@ def test_what_follows_a_column_through_a_lag_is_told_of_that_column(leak: float,
     assert followed(measured, "bias_temperature") == "pressure[earlier]"
 
 
+@pytest.mark.long
 def test_a_scale_factor_that_warms_up_follows_rate_and_time(rng: np.random.Generator):
     """No step, no drift, and no set of anomalous dwells: an exponential of 30 standard deviations."""
     rate = np.tile(np.repeat([0.0, 50.0, -50.0, 100.0, -100.0, 0.0], 10), 20)
@@ -143,6 +144,7 @@ def test_a_large_warm_up_beside_a_rising_temperature_is_no_curve(rng: np.random.
     assert "bias_warmup" in found.credible_set
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("change", "driver"),
     [("jump", "rate and time"), ("ripple", "rate and temperature"), ("buried", "rate and temperature[earlier]")],

@@ -17,8 +17,8 @@ from gyromodel.noise import NoiseRatios
 
 NoisePath = Sequence[NoiseRatios]
 
-# Part of what it explains that an effect may lose for a shape that lies between those searched; of its evidence, where
-# slow noise holds the rest.
+# Part of what it explains that an effect may lose for a shape that lies between those searched; and of its evidence,
+# where slow noise holds that part.
 BETWEEN, IN_NOISE = 0.05, 0.25
 # Evidence (nats) from which on what continues an effect is fitted to be ranked.
 BY_FIT = 20.0
@@ -130,7 +130,11 @@ class Steps:
         near = grown | {
             k
             for k, v in ranking.statistic.items()
-            if self._has_shape(k) and (ranking.explained(k) >= least or v >= (1.0 - IN_NOISE) * score)
+            if self._has_shape(k)
+            and (
+                ranking.explained(k) >= least
+                or (v >= (1.0 - IN_NOISE) * score and ranking.share(k, name) >= 1.0 - BETWEEN)
+            )
         }
         if not near - {name} and (name not in near or driver < score):
             return ranking
