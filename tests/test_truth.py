@@ -301,7 +301,10 @@ SCANNED = [
 @pytest.mark.long
 @pytest.mark.parametrize(("name", "effect"), SCANNED)
 def test_search_over_shapes_has_about_the_power_the_mde_promises(name, effect, rng):
-    """Over every shape at once, at 1 %/20 false alarms: 80 %, but for what noise of another colour makes of trials."""
+    """Over every shape at once, at 1 %/20 false alarms: 80 %, but for what noise of another colour makes of trials.
+
+    A step late in a run has up to 93 %.
+    """
     design = (DESIGNS | MOTION_DESIGNS)[name](rng)
     law = noise.draw("white", design, rng)
     judge = oracle(design, law, baseline(design, effect) + simpler(effect))
@@ -323,7 +326,7 @@ def test_search_over_shapes_has_about_the_power_the_mde_promises(name, effect, r
     wrong = error(effect, design, amplitude(effect, design, law, shape, 1.0), shape)
     reduced = judge.reduce(wrong[:, None])[:, 0]
     assert np.linalg.norm(reduced) == pytest.approx(target(effect))
-    assert 0.65 < np.mean(peaks(reduced, 2000) > limit) < 0.93
+    assert 0.65 < np.mean(peaks(reduced, 2000) > limit) < 0.96
 
 
 def test_every_effect_of_several_coefficients_is_tested_with_all_of_them(rng):

@@ -75,8 +75,10 @@ def credible(
         of_data = own[name] + scanner.bank.price(name)
         same = {k: of_data - scanner.bank.price(k) for k in twins(scanner, ranking, name) - apart}
         own |= {k: max(own.get(k, 0.0), value) for k, value in same.items()}
-    # A drift comes back with the next run, and a step does not.
-    if (scanner.runs < 2 or name == "bias_step") and (hidden or too_close):
+    # A drift comes back with the next run, a warm-up with the next power-on, and a step does not.
+    again = name == "bias_warmup" and np.ptp(scanner.record.signals.get("run", np.zeros(1))) > 0
+    once = scanner.runs < 2 and not again
+    if (once or name == "bias_step") and (hidden or too_close):
         own["noise_random_walk"] = max(0.0, statistic - 1.0)
     top = max(own.values())
     weight = {k: float(np.exp(v - top)) for k, v in own.items()}
