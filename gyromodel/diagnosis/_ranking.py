@@ -151,11 +151,6 @@ class Ranking:
         result = self.results[self.best_cell(name)]
         return result.best[name][1] / result.rss
 
-    def share(self, name: str, other: str) -> float:
-        """The most that a candidate's best form explains of what another's does in the same noise."""
-        both = [r.best for r in self.results.values() if {name, other} <= r.best.keys() and r.best[other][1] > 0]
-        return max((best[name][1] / best[other][1] for best in both), default=0.0)
-
 
 def evidence_in(results: dict[int, CellResult], cells: Iterable[int], log_prior: np.ndarray, name: str) -> float:
     """ln B of a candidate, summed over some noise cells."""

@@ -17,9 +17,8 @@ from gyromodel.noise import NoiseRatios
 
 NoisePath = Sequence[NoiseRatios]
 
-# Part of what it explains that an effect may lose for a shape that lies between those searched; and of its evidence,
-# where slow noise holds that part.
-BETWEEN, IN_NOISE = 0.05, 0.25
+# Part of what it explains that an effect may lose for a shape that lies between those searched.
+BETWEEN = 0.05
 # Evidence (nats) from which on what continues an effect is fitted to be ranked.
 BY_FIT = 20.0
 # Times that the uncertainty of a shape may grow by that of all others.
@@ -127,15 +126,7 @@ class Steps:
         if not name or not (name in ranking.tangents or self.scanner.bank.forms(name)):
             return ranking
         least = (1.0 - BETWEEN) * ranking.explained(name)
-        near = grown | {
-            k
-            for k, v in ranking.statistic.items()
-            if self._has_shape(k)
-            and (
-                ranking.explained(k) >= least
-                or (v >= (1.0 - IN_NOISE) * score and ranking.share(k, name) >= 1.0 - BETWEEN)
-            )
-        }
+        near = grown | {k for k in ranking.statistic if self._has_shape(k) and ranking.explained(k) >= least}
         if not near - {name} and (name not in near or driver < score):
             return ranking
         each = [self.step(found, estimate, ranking, k) for k in {name, *near}]
