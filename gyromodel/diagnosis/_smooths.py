@@ -17,16 +17,17 @@ Smooth = tuple[str, np.ndarray, np.ndarray]
 # Length scales of the smooth functions, as parts of the driver's range; and of ripples over a measured column.
 SMOOTH_SCALES, RIPPLE = (0.08, 0.2, 0.5), 0.03
 PAIR_SCALES = (0.25, 0.6)
-# Periods over a slow column's range of what repeats along it, more often than those ripples can, if it is among as many
-# first ones; less those whose phase departs less (rad) from a straight line in time: they are lines.
+# Periods over a slow column's range of what repeats along it, more often than those ripples can; of how many of the
+# first columns; less those whose phase departs less (rad) from a straight line in time: they are lines.
 PERIODS, SWEPT, STRAIGHT = tuple(np.arange(10.0, 60.5, 0.5)), 3, 1.0
 # Thresholds of a column at which something may switch: as many, with as many samples between; less those that a column
 # crosses about once, of which this part of the variance or more is a step's in time.
 THRESHOLDS, ONE_STEP = 63, 0.9
 # Samples in which a torquer warms up, at the least: from row to row of a table it would be a curve over the rate.
 WARMING = 4
-# A thermometer of which the rate's power explains this part, but for noise, measures what the rate warms.
-WARMED = 0.9
+# A thermometer of which the rate's power explains this part, but for noise, measures what the rate warms, unless this
+# part or more is noise.
+WARMED, MOSTLY_NOISE = 0.9, 0.9
 # Columns of one kind whose product no effect holds.
 UNLIKE = {"rate", "rate_output"}, {"rate_output", "rate_spin"}
 # Rates crowd where their order places one this far, of the whole range, from where its value does.
@@ -191,9 +192,10 @@ def _heated(record: Record) -> Iterator[Smooth]:
 def _measures(record: Record, name: str, values: np.ndarray) -> bool:
     """Whether a thermometer shows some values and its noise, which second differences tell."""
     shown = np.asarray(record.signals[name])[: record.rows]
-    own = np.var(shown) - np.mean(np.diff(shown, 2) ** 2) / 6.0
-    covariance = np.mean((shown - shown.mean()) * (values - values.mean()))
-    return bool(kind_of(record, name) == "temperature" and covariance**2 > WARMED * own * np.var(values))
+    noise = np.mean(np.diff(shown, 2) ** 2) / 6.0 / np.var(shown)
+    if kind_of(record, name) != "temperature" or not noise < MOSTLY_NOISE:
+        return False
+    return bool(np.corrcoef(shown, values)[0, 1] ** 2 > WARMED * (1.0 - noise))
 
 
 def _lags(time: np.ndarray, runs: list[np.ndarray]) -> list[float]:
