@@ -19,14 +19,10 @@ def log(output: np.ndarray, rng: np.random.Generator, **columns: np.ndarray) -> 
     return gm.Campaign(of, {n: units.get(n, "s" if n == "time" else "deg/h") for n in of}, {"kind": "rate"})
 
 
-def followed(measured: gm.Campaign, *simulated: str, beside: tuple[str, ...] = ()) -> str | None:
-    """The columns that an unknown discrepancy follows, under a simulation with a bias and these effects.
-
-    Names that may take parts of it are given by `beside`.
-    """
+def followed(measured: gm.Campaign, *simulated: str) -> str | None:
+    """The columns that an unknown discrepancy follows, under a simulation with a bias and these effects."""
     found = gm.diagnose(measured, gm.model_from_effects(["bias", *simulated]), hold_out=False)
-    assert found.verdict == "unknown"
-    assert {c.effect for c in found.causes} <= set(beside)
+    assert (found.verdict, found.causes) == ("unknown", ())
     return found.driver and found.driver.column
 
 
@@ -82,12 +78,17 @@ def ramps(number: float) -> np.ndarray:
     return 60.0 * np.abs((number * TIME / TIME[-1] + 1.0) % 2.0 - 1.0)
 
 
+@pytest.mark.long
 def test_fringes_that_pass_as_often_in_straight_ramps_are_no_lines(rng: np.random.Generator):
-    """In time they beat where a ramp turns, and are two or three steady lines side by side."""
-    inside = ramps(rng.uniform(2.5, 6.0))
-    fringes = np.sin(2 * np.pi * inside / rng.uniform(1.2, 4.0) + rng.uniform(0.0, 6.0))
-    measured = log(0.5 + 0.08 * fringes, rng, temperature=inside)
-    assert followed(measured, beside=("bias_periodic",)) == "temperature"
+    """In time they beat where a ramp turns, and are steady lines side by side: told so in less than one of ten."""
+    drivers = []
+    for _ in range(4):
+        inside = ramps(rng.uniform(3.0, 5.0))
+        fringes = np.sin(2 * np.pi * inside / rng.uniform(1.2, 4.0) + rng.uniform(0.0, 6.0))
+        measured = log(0.5 + 0.08 * fringes, rng, temperature=inside)
+        found = gm.diagnose(measured, gm.model_from_effects(["bias"]), hold_out=False)
+        drivers.append(found.driver and found.driver.column)
+    assert drivers.count("temperature") > 1
 
 
 @pytest.mark.parametrize("number", [1.0, 4.2])
