@@ -303,7 +303,7 @@ SCANNED = [
 def test_search_over_shapes_has_about_the_power_the_mde_promises(name, effect, rng):
     """Over every shape at once, at 1 %/20 false alarms: 80 %, but for what noise of another colour makes of trials.
 
-    A step late in a run has up to 93 %.
+    A draw of a step had 93.3 %: the upper bound is of what was seen, not of theory.
     """
     design = (DESIGNS | MOTION_DESIGNS)[name](rng)
     law = noise.draw("white", design, rng)

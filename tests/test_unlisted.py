@@ -80,7 +80,7 @@ def ramps(number: float) -> np.ndarray:
 
 @pytest.mark.long
 def test_fringes_that_pass_as_often_in_straight_ramps_are_no_lines(rng: np.random.Generator):
-    """In time they beat where a ramp turns, and are steady lines side by side: told so in less than one of ten."""
+    """In time they beat where a ramp turns, and are steady lines side by side: still told so in some draws."""
     drivers = []
     for _ in range(4):
         inside = ramps(rng.uniform(3.0, 5.0))
