@@ -5,7 +5,7 @@ Arrays are padded to a few fixed lengths, so that compiled functions serve every
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from gyromodel._checks import MISSING_STEP, CampaignError, thermometers
 from gyromodel.campaign import Campaign
 from gyromodel.effects._base import Domain
-from gyromodel.numerics.smoothing import smooth_derivative
+from gyromodel.numerics.smoothing import smooth_derivative, smooth_values
 from gyromodel.numerics.state_space import Sampling
 from gyromodel.units import UnitError, convertible, factor, internal_unit, quantity
 
@@ -253,24 +253,51 @@ def _time_on(campaign: Campaign, time: np.ndarray) -> np.ndarray:
 
 def thermometer_rate(record: Record, temperature: np.ndarray) -> np.ndarray:
     """The signal temperature_rate that a record would have with another temperature, one value a row."""
+    return _by_run(record, temperature, _thermometer_rate)
+
+
+def with_smooth_thermometers(record: Record) -> Record:
+    """The record with every thermometer as the spline has it whose slope its rate is."""
+    signals = dict(record.signals)
+    for name in thermometers(signals):
+        measured = np.asarray(signals[name])
+        smooth = _by_run(record, measured[: record.rows], _smooth_thermometer)
+        signals[name] = jnp.asarray(np.pad(smooth, (0, len(measured) - record.rows), mode="edge"))
+    return record._replace(signals=signals)
+
+
+def _by_run(record: Record, values: np.ndarray, of: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
+    """What `of` makes of the times and values of each run, one value a row."""
     time = np.asarray(record.signals["time"])[: record.rows]
     runs = np.cumsum(np.asarray(record.sampling.restart)[: record.rows])
-    return np.concatenate([_thermometer_rate(time[runs == i], temperature[runs == i]) for i in np.unique(runs)])
+    return np.concatenate([of(time[runs == i], values[runs == i]) for i in np.unique(runs)])
 
 
 def _thermometer_rate(time: np.ndarray, temperature: np.ndarray) -> np.ndarray:
     """dT/dt of the smoothed thermometer, each stretch by itself; a sample alone takes the slope to its neighbours."""
-    stretch = stretches_of(time)
     good = np.isfinite(temperature)
     rate = np.full(len(time), np.nan)
     if good.sum() < 2:
         return rate
     rate[good] = np.gradient(temperature[good], time[good])
+    return _by_stretch(time, temperature, smooth_derivative, rate)
+
+
+def _smooth_thermometer(time: np.ndarray, temperature: np.ndarray) -> np.ndarray:
+    """The smoothed thermometer, each stretch by itself."""
+    return _by_stretch(time, temperature, smooth_values, temperature.copy())
+
+
+def _by_stretch(
+    time: np.ndarray, values: np.ndarray, of: Callable[[np.ndarray, np.ndarray], np.ndarray], into: np.ndarray
+) -> np.ndarray:
+    """What `of` makes of each stretch of two known values or more, put into an array."""
+    stretch, good = stretches_of(time), np.isfinite(values)
     for s in np.unique(stretch):
         here = good & (stretch == s)
         if here.sum() > 1:
-            rate[here] = smooth_derivative(time[here], temperature[here])
-    return rate
+            into[here] = of(time[here], values[here])
+    return into
 
 
 def with_columns_known(record: Record) -> tuple[Record, list[str]]:

@@ -9,7 +9,7 @@ from scipy.interpolate import make_smoothing_spline
 from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter, savgol_filter
 
-from gyromodel.numerics.smoothing import _best_fit, smooth_derivative, smoothing_bandwidth
+from gyromodel.numerics.smoothing import _best_fit, smooth_derivative, smooth_values, smoothing_bandwidth
 
 ROWS, STEP = 1800, 10.0
 TIME = np.arange(ROWS) * STEP
@@ -98,8 +98,22 @@ def test_the_bandwidth_is_where_a_sine_falls_to_its_half_power(rows: int, rng: n
     assert passed @ wave[middle] / (wave[middle] @ wave[middle]) == pytest.approx(np.sqrt(0.5), abs=0.02)
 
 
+@pytest.mark.parametrize("course", list(COURSES))
+def test_the_smooth_record_is_nearer_the_truth_and_has_the_slope_of_its_derivative(
+    course: str, rng: np.random.Generator
+):
+    measured = COURSES[course] + 0.02 * rng.standard_normal(ROWS)
+    smooth = smooth_values(TIME, measured)
+    assert error(smooth, COURSES[course]) < 0.7 * error(measured, COURSES[course])
+    inner = slice(5, -5)
+    slope = np.gradient(smooth, TIME)[inner] - smooth_derivative(TIME, measured)[inner]
+    assert np.std(slope) < 0.1 * np.std(np.gradient(smooth, TIME))
+
+
 def test_nothing_to_smooth():
     assert np.array_equal(smooth_derivative(np.arange(9.0), np.ones(9)), np.zeros(9))
+    for values in (np.ones(9), np.arange(4.0) ** 2):
+        assert np.array_equal(smooth_values(np.arange(float(len(values))), values), values)
     for time in (np.arange(4.0), np.arange(9.0)):
         with pytest.raises(ValueError, match="six samples"):
             smoothing_bandwidth(time, np.ones(len(time)))

@@ -130,16 +130,27 @@ def test_the_heat_of_a_torquer_follows_what_the_rate_was(rng: np.random.Generato
     assert followed(measured, "scale_factor") == "rate[earlier]"
 
 
-@pytest.mark.parametrize("noise", [0.005, 0.02])
+@pytest.mark.parametrize("noise", [0.005, 0.02, 0.2])
 def test_a_measured_heat_of_a_torquer_is_temperature(noise: float, rng: np.random.Generator):
-    """400 standard deviations of a bias over temperature, which a computed heat would follow without the noise."""
+    """A bias over temperature of 400 standard deviations: what is computed of the rate, or smooths, has less noise."""
     rate = table(rng)
     warm = leaked((rate / 100.0) ** 2, STEP, rng.uniform(500.0, 2000.0))
     measured = log(3600.0 * rate + 0.5 + 400.0 * 0.05 / np.linalg.norm(warm - warm.mean()) * warm, rng,
                    rate=rate, temperature=25.0 + 8.0 * warm + noise * rng.standard_normal(len(TIME)))  # fmt: skip
     found = gm.diagnose(measured, gm.model_from_effects(["bias", "scale_factor"]), hold_out=False)
-    # What is left of the thermometer's noise may pass for a little hysteresis.
-    assert (found.verdict, found.causes[0].effect) == ("named", "bias_temperature")
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["bias_temperature"])
+
+
+def test_a_thermometer_is_smoothed_where_its_noise_is_its_own_alone(rng: np.random.Generator):
+    inside = chamber(rng)
+    noisy = inside + 0.5 * rng.standard_normal(len(TIME))
+    for followed, smoothed in ((inside, True), (noisy, False)):
+        measured = log(0.5 + 0.01 * followed, rng, temperature=noisy)
+        found = gm.diagnose(measured, gm.model_from_effects(["bias"]), hold_out=False)
+        assert [c.effect for c in found.causes] == ["bias_temperature"]
+        assert any("smoothed" in line for line in found.findings) == smoothed
+        (slope,) = found.causes[0].parameters
+        assert abs(slope.value - 0.01) < 5.0 * slope.std
 
 
 @pytest.mark.long

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from gyromodel._checks import CampaignError, listed
+from gyromodel._checks import CampaignError, listed, thermometers
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores, threshold_of
@@ -31,12 +31,18 @@ from gyromodel.diagnosis._verdict import FAINT, judge, structured, with_noise
 from gyromodel.estimate import Estimate, EstimateError, check_covariates, fit_record, with_noise_intervals
 from gyromodel.model import GyroModel, record_span
 from gyromodel.noise import NoiseGrid, NoiseRatios, noise_grid
-from gyromodel.signals import Record, with_columns_known
+from gyromodel.signals import Record, with_columns_known, with_smooth_thermometers
 from gyromodel.units import factor, from_internal
 
 FEWEST_DRAWS = 200
 # Folds search the noise cells within this many nats of the best of the main pass.
 FOLD_NEARBY = 3.0
+# Nats that noise of thermometers may have cost from which on they are smoothed and searched again: it is an estimate.
+LOST = 0.5
+SMOOTHED = (
+    "Temperatures were smoothed: the error follows the smooth record better, so that the rest is noise of the "
+    "thermometer, which the model adds where it is applied to temperatures as they were read."
+)
 
 
 class _Session:
@@ -129,6 +135,9 @@ def diagnose(
         nulls = null_scores(session.scanner, baseline, calibrate, seed, say)
         session.threshold = max(threshold_of(nulls), 0.0)
     selection = session.run(baseline, say)
+    if others := _with_smooth_thermometers(session, baseline, selection, say):
+        record, baseline, session, selection = others
+        findings.append(SMOOTHED)
     beyond: list[Cause] = []
     grows, following = growing_noise(record, selection.estimate), None
     if grows is not None:
@@ -138,6 +147,7 @@ def diagnose(
         except EstimateError:
             grows = None
         else:
+            bank, grid = session.scanner.bank, session.scanner.grid
             scanner = Scanner(weighted, bank, grid, stated=alike.noise_given, step=data.step)
             again = _Session(scanner, session.threshold)
             other = again.run(alike, say)
@@ -267,6 +277,42 @@ def _finished(estimate: Estimate, ordinary: bool) -> Estimate:
         with contextlib.suppress(EstimateError):
             estimate = fit_record(estimate.record, estimate.model_as_given(), ordinary=True)
     return with_noise_intervals(estimate)
+
+
+def _with_smooth_thermometers(
+    session: _Session, baseline: Estimate, selection: Selection, say: Progress
+) -> tuple[Record, Estimate, _Session, Selection] | None:
+    """The search over smoothed thermometers, where their noise may cost evidence and the data are explained better so.
+
+    Noise of a thermometer is none of what it measures: all that smooths, a lag or a narrow loop, would take it away.
+    """
+    record = with_smooth_thermometers(session.record)
+    if _lost_to_thermometers(session.record, record, baseline, selection) < LOST:
+        return None
+    try:
+        alike = fit_record(record, baseline.model_as_given())
+    except EstimateError:
+        return None
+    scanner = Scanner(record, build_bank(record), session.scanner.grid, stated=alike.noise_given)
+    again = _Session(scanner, session.threshold)
+    other = again.run(alike, say)
+    measured, smooth = (Steps(s.scanner, e, s.threshold) for s, e in ((session, baseline), (again, alike)))
+    better = other.found and smooth.fits_better(other.found, selection.found, EXCHANGE, measured)
+    return (record, alike, again, other) if better else None
+
+
+def _lost_to_thermometers(measured: Record, smooth: Record, baseline: Estimate, selection: Selection) -> float:
+    """The evidence (nats) that noise of thermometers may cost the model, what was found or what might have been."""
+    here, lost = measured.present, [0.0]
+    for estimate in (baseline, selection.estimate):
+        before, after = (np.asarray(estimate.model.predict(r.signals))[: r.rows][here] for r in (measured, smooth))
+        lost.append(0.5 * float(np.sum((after - before) ** 2)) / estimate.white_variance)
+    first = selection.path[0].ranking if selection.path else selection.last
+    for name in thermometers(measured.signals):
+        before, after = (np.asarray(r.signals[name])[: r.rows][here] for r in (measured, smooth))
+        share = np.var(after - before) / max(np.var(before), np.finfo(float).tiny)
+        lost.append(float(share) * max(first.statistic.values()))
+    return max(lost)
 
 
 def _without_axis(

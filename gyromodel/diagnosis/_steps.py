@@ -146,11 +146,13 @@ class Steps:
             return ranking
         return replace(ranking, statistic=ranking.statistic | told, fitted=frozenset(told))
 
-    def fits_better(self, found: Sequence[Found], other: Sequence[Found]) -> bool:
-        """Whether some steps fit better than others, on the data that both keep."""
+    def fits_better(
+        self, found: Sequence[Found], other: Sequence[Found], by: float = 0.0, of: Steps | None = None
+    ) -> bool:
+        """Whether some steps fit better by so many nats than others, of this search or another, on what both keep."""
         given_up = Found("", None, rows_of([*found, *other]), found[0].ranking)
-        one, two = (self.fit([*steps, given_up]) for steps in (found, other))
-        return one is not None and (two is None or bool(_quality(one) > _quality(two)))
+        one, two = (s.fit([*steps, given_up]) for s, steps in ((self, found), (of or self, other)))
+        return one is not None and (two is None or bool(_quality(one) > _quality(two) + by))
 
     def _has_shape(self, name: str) -> bool:
         """Whether a candidate's shape goes on between the forms searched; a fit of a platform takes too long for it."""

@@ -1,4 +1,4 @@
-"""Derivative of a noisy, unevenly sampled record by a cubic smoothing spline, smooth by robust cross-validation.
+"""A noisy, unevenly sampled record and its derivative by a cubic smoothing spline, smooth by robust cross-validation.
 
 Criterion: M. A. Lukas, Robust generalized cross-validation for choosing the regularization parameter, Inverse Problems
 22 (2006).
@@ -42,6 +42,16 @@ def smooth_derivative(
         return np.gradient(values, time) if n > 1 else np.zeros(n)
     smooth = _smoothed(time, values)
     return np.asarray(smooth.spline.derivative()((time - smooth.start) / smooth.unit)) / smooth.unit
+
+
+def smooth_values(
+    time: Float[np.ndarray, " sample"], values: Float[np.ndarray, " sample"]
+) -> Float[np.ndarray, " sample"]:
+    """The smoothed record itself, whose derivative `smooth_derivative` is; fewer than six samples are as they are."""
+    if len(time) < 6 or np.ptp(values) == 0:
+        return values
+    smooth = _smoothed(time, values)
+    return np.asarray(smooth.spline((time - smooth.start) / smooth.unit))
 
 
 def smoothing_bandwidth(time: Float[np.ndarray, " sample"], values: Float[np.ndarray, " sample"]) -> float:
