@@ -9,84 +9,36 @@ from typing import Literal
 
 import numpy as np
 
-from gyromodel._checks import CampaignError, listed, thermometers
+from gyromodel._checks import listed
 from gyromodel.campaign import Campaign
-from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores, threshold_of
-from gyromodel.diagnosis._data import Data, read
+from gyromodel.diagnosis._data import read
 from gyromodel.diagnosis._evidence import SAFE_THRESHOLD
-from gyromodel.diagnosis._gain import ladder_error, nested_gain, no_gain, not_measured
+from gyromodel.diagnosis._gain import nested_gain, no_gain, not_measured
 from gyromodel.diagnosis._isolation import settling_test
 from gyromodel.diagnosis._misfit import excess_band, unexplained_axes
 from gyromodel.diagnosis._noise_causes import as_cause, quantisation, telegraph
 from gyromodel.diagnosis._points import dwells_apart
 from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, cells_of_weight, is_driver, is_noise, noise_kinds
 from gyromodel.diagnosis._result import Candidate, Cause, Diagnosis, Gain, ParameterValue, Round
-from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._search import Progress, Selection, search, significant_driver, steadied
+from gyromodel.diagnosis._search import Progress, Selection
+from gyromodel.diagnosis._session import Session, laid_out, over_smooth_thermometers, over_weighted, without_axis
 from gyromodel.diagnosis._shapes import driver_shape, minimum_detectable, not_testable
-from gyromodel.diagnosis._steps import EXCHANGE, Found, NoisePath, Steps, standing
-from gyromodel.diagnosis._variance import follow, growing_noise, noise_level, tails, with_variance
+from gyromodel.diagnosis._steps import Found
+from gyromodel.diagnosis._variance import follow, growing_noise, noise_level, tails
 from gyromodel.diagnosis._verdict import FAINT, judge, structured, with_noise
 from gyromodel.estimate import Estimate, EstimateError, check_covariates, fit_record, with_noise_intervals
-from gyromodel.model import GyroModel, record_span
-from gyromodel.noise import NoiseGrid, NoiseRatios, noise_grid
-from gyromodel.signals import Record, with_columns_known, with_smooth_thermometers
+from gyromodel.model import GyroModel
+from gyromodel.signals import with_columns_known
 from gyromodel.units import factor, from_internal
 
 FEWEST_DRAWS = 200
 # Folds search the noise cells within this many nats of the best of the main pass.
 FOLD_NEARBY = 3.0
-# Nats that noise of thermometers may have cost from which on they are smoothed and searched again: it is an estimate.
-LOST = 0.5
 SMOOTHED = (
     "Temperatures were smoothed: the error follows the smooth record better, so that the rest is noise of the "
     "thermometer, which the model adds where it is applied to temperatures as they were read."
 )
-
-
-class _Session:
-    """One record with its search laid out: what the main pass and every fold do alike."""
-
-    def __init__(self, scanner: Scanner, threshold: float) -> None:
-        self.record, self.scanner, self.threshold = scanner.record, scanner, threshold
-        self._ladder: dict[int, tuple[float, float, bool]] = {}
-
-    def ladder(self, estimate: Estimate) -> tuple[float, float, bool]:
-        """Held-out rms, log score and weighting of an estimate's structure, computed once."""
-        if id(estimate) not in self._ladder:
-            self._ladder[id(estimate)] = ladder_error(estimate.record, estimate)
-        return self._ladder[id(estimate)]
-
-    def run(self, baseline: Estimate, progress: Progress = None, noise: NoisePath = ()) -> Selection:
-        """The rounds."""
-        return search(Steps(self.scanner, baseline, self.threshold, noise), progress)
-
-    def pruned(self, selection: Selection) -> Selection:
-        """The rounds, cut where (after the first step) the error on blocks left out stops falling."""
-        for i in range(2, len(selection.estimates)):
-            # Two that show only together are judged together.
-            step, first = selection.path[i - 1], i - 1 - selection.path[i - 2].paired
-            now, before = self.ladder(selection.estimates[i]), self.ladder(selection.estimates[first])
-            if first and not step.paired and step.effect is not None and now[0] > before[0] and now[1] < before[1]:
-                path, estimates = selection.path[:first], selection.estimates[: first + 1]
-                found, ranking = tuple(standing(path)), step.ranking
-                # What was cut may have stood for a driver that was ahead of it.
-                driver = significant_driver(ranking, self.threshold)
-                if driver and ranking.statistic[driver] < ranking.statistic[step.name] + EXCHANGE:
-                    driver = None
-                cut = Selection(
-                    estimates[-1],
-                    found,
-                    path,
-                    ranking,
-                    estimates,
-                    driver,
-                    remains=step.name,
-                    beside_it=selection.estimates[i],
-                )
-                return steadied(Steps(self.scanner, estimates[0], self.threshold), cut)
-        return selection
 
 
 def diagnose(
@@ -124,39 +76,21 @@ def diagnose(
     record, left_out = with_columns_known(record)
     findings += left_out
     say("fitting the simulation", 0.02)
-    baseline = fit_record(record, model)
-    say("laying out the search", 0.06)
-    bank = build_bank(record)
-    grid = _grid(record, baseline)
-    scanner = Scanner(record, bank, grid, stated=baseline.noise_given, step=data.step)
-    session = _Session(scanner, SAFE_THRESHOLD)
+    session = laid_out(record, model, SAFE_THRESHOLD, data.step)
     nulls = np.zeros(0)
     if calibrate:
-        nulls = null_scores(session.scanner, baseline, calibrate, seed, say)
+        nulls = null_scores(session.scanner, session.baseline, calibrate, seed, say)
         session.threshold = max(threshold_of(nulls), 0.0)
-    selection = session.run(baseline, say)
-    if others := _with_smooth_thermometers(session, baseline, selection, say):
-        record, baseline, session, selection = others
+    selection = session.run(say)
+    if record.domain == "gyro" and (others := over_smooth_thermometers(session, selection, model, say)):
+        session, selection = others
         findings.append(SMOOTHED)
     beyond: list[Cause] = []
-    grows, following = growing_noise(record, selection.estimate), None
-    if grows is not None:
-        weighted = with_variance(record, grows.white)
-        try:
-            alike = fit_record(weighted, model)
-        except EstimateError:
-            grows = None
-        else:
-            bank, grid = session.scanner.bank, session.scanner.grid
-            scanner = Scanner(weighted, bank, grid, stated=alike.noise_given, step=data.step)
-            again = _Session(scanner, session.threshold)
-            other = again.run(alike, say)
-            if _unfinished(other):
-                # Structure that is left passes for a level that varies; without any left, the level passed for it.
-                grows = None
-            else:
-                record, baseline, session, selection = weighted, alike, again, other
-    if grows is not None:
+    grows, following = growing_noise(session.record, selection.estimate), None
+    others = over_weighted(session, grows.white, model, say) if grows else None
+    grows = grows if others else None
+    if grows and others:
+        session, selection = others
         times = max(grows.ratio, 1.0 / grows.ratio)
         findings.append(
             f"The noise level follows {grows.driver}, {times:.3g} times as large at one end as at the other; samples "
@@ -169,15 +103,16 @@ def diagnose(
             beyond.append(as_cause("noise_heteroscedastic", grows.evidence, ratio))
     if record.domain == "platform" and selection.found and (failed := unexplained_axes(selection.estimate)):
         moves = f"the base moves about {listed(failed)} as nothing in the catalogue makes it"
-        others = _without_axis(measured, failed[0], model, session.threshold, say)
+        others = without_axis(measured, failed[0], model, session.threshold, say)
         if others is None:
             findings.append(f"Values may be wrong by more than their uncertainties: {moves}.")
         else:
-            data, record, baseline, session, selection = others
+            data, session, selection = others
             findings.append(
                 f"Runs about {failed[0]} were left out: with them {moves}, without them all is explained. A shaft that "
                 "sticks makes such an axis."
             )
+    record, baseline = session.record, session.baseline
     free = _with_noise_estimated(selection.estimate)
     hops = telegraph(baseline, free, unit) if free and record.domain == "gyro" and _like_hops(selection, free) else None
     if hops is not None:
@@ -199,6 +134,7 @@ def diagnose(
             f"{'' if np.isfinite(stated) else ', unless it is wired so'}."
         )
     say("judging", 0.65)
+    names = session.scanner.bank.names()
     scale = factor(record.input_unit, unit)
     ordinary = tuple(hold_out and session.ladder(e)[2] for e in (baseline, selection.estimate))
     extended = _finished(selection.estimate, ordinary[1])
@@ -208,13 +144,12 @@ def diagnose(
             "Parameters weigh all samples alike: that predicts left-out blocks better than the fitted noise's weights "
             "do."
         )
-    steps = Steps(session.scanner, baseline, session.threshold)
-    judgement = judge(steps, selection, extended, len(bank.names()), nulls, data.rows_of)
+    judgement = judge(session.steps, selection, extended, len(names), nulls, data.rows_of)
     # What follows itself at one end of a column has structure, whatever faint name takes a part of it.
     if following and grows and all(c.statistic < FAINT for c in judgement.causes):
         judgement = structured(judgement, selection.last, grows.column)
     stepped = None
-    if record.domain == "gyro" and not _unfinished(selection) and (free := _with_noise_estimated(selection.estimate)):
+    if record.domain == "gyro" and not selection.unfinished and (free := _with_noise_estimated(selection.estimate)):
         stepped = quantisation(free, session.threshold)
     if stepped is not None:
         beyond.append(stepped)
@@ -227,7 +162,9 @@ def diagnose(
         findings.append(band)
     # Where the simulation leaves its noise to be estimated, its kinds are no discrepancy, but for what no fit holds.
     judgement = with_noise(
-        judgement, beyond if baseline.noise_given else [c for c in beyond if c is hops], len(bank.names())
+        judgement,
+        beyond if baseline.noise_given else [c for c in beyond if c is hops],
+        len(names),
     )
     next_test = judgement.next_test
     if judgement.verdict == "ambiguous":
@@ -259,7 +196,7 @@ def diagnose(
         threshold=session.threshold + _more_needed(rankings[0], selection.path),
         threshold_kind="calibrated" if calibrate else "safe",
         p_value=_p_value(selection, nulls) if calibrate else None,
-        searched=tuple(dict.fromkeys([*bank.names(), *(name for r in rankings for name in r.tangents)])),
+        searched=tuple(dict.fromkeys([*names, *(name for r in rankings for name in r.tangents)])),
         campaign=data.whole,
         predicted_before=from_internal(before, data.output_unit),
         predicted_after=from_internal(after, data.output_unit),
@@ -279,78 +216,6 @@ def _finished(estimate: Estimate, ordinary: bool) -> Estimate:
     return with_noise_intervals(estimate)
 
 
-def _with_smooth_thermometers(
-    session: _Session, baseline: Estimate, selection: Selection, say: Progress
-) -> tuple[Record, Estimate, _Session, Selection] | None:
-    """The search over smoothed thermometers, where their noise may cost evidence and the data are explained better so.
-
-    Noise of a thermometer is none of what it measures: all that smooths, a lag or a narrow loop, would take it away.
-    """
-    record = with_smooth_thermometers(session.record)
-    if _lost_to_thermometers(session.record, record, baseline, selection) < LOST:
-        return None
-    try:
-        alike = fit_record(record, baseline.model_as_given())
-    except EstimateError:
-        return None
-    scanner = Scanner(record, build_bank(record), session.scanner.grid, stated=alike.noise_given)
-    again = _Session(scanner, session.threshold)
-    other = again.run(alike, say)
-    measured, smooth = (Steps(s.scanner, e, s.threshold) for s, e in ((session, baseline), (again, alike)))
-    better = other.found and smooth.fits_better(other.found, selection.found, EXCHANGE, measured)
-    return (record, alike, again, other) if better else None
-
-
-def _lost_to_thermometers(measured: Record, smooth: Record, baseline: Estimate, selection: Selection) -> float:
-    """The evidence (nats) that noise of thermometers may cost the model, what was found or what might have been."""
-    here, lost = measured.present, [0.0]
-    for estimate in (baseline, selection.estimate):
-        before, after = (np.asarray(estimate.model.predict(r.signals))[: r.rows][here] for r in (measured, smooth))
-        lost.append(0.5 * float(np.sum((after - before) ** 2)) / estimate.white_variance)
-    first = selection.path[0].ranking if selection.path else selection.last
-    for name in thermometers(measured.signals):
-        before, after = (np.asarray(r.signals[name])[: r.rows][here] for r in (measured, smooth))
-        share = np.var(after - before) / max(np.var(before), np.finfo(float).tiny)
-        lost.append(float(share) * max(first.statistic.values()))
-    return max(lost)
-
-
-def _without_axis(
-    measured: Sequence[Campaign], axis: str, model: GyroModel, threshold: float, say: Progress
-) -> tuple[Data, Record, Estimate, _Session, Selection] | None:
-    """The search of the runs about other axes, if there are any and what it finds explains them."""
-    try:
-        data = read(measured, without=axis)
-        record, _ = with_columns_known(data.record)
-        baseline = fit_record(record, model)
-    except (CampaignError, EstimateError):
-        return None
-    grid = _grid(record, baseline)
-    scanner = Scanner(record, build_bank(record), grid, stated=baseline.noise_given, step=data.step)
-    session = _Session(scanner, threshold)
-    selection = session.run(baseline, say)
-    explained = selection.found and not unexplained_axes(selection.estimate)
-    return (data, record, baseline, session, selection) if explained else None
-
-
-def _grid(record: Record, baseline: Estimate) -> NoiseGrid:
-    """Noise cells: the whole family; where the model states its noise, that cell first."""
-    grid = noise_grid(int(record.present.sum()), record.interval, record_span(record))
-    if not baseline.noise_given:
-        return grid
-    stated, prior = baseline.ratios, grid.log_prior
-    each = [np.asarray(r) for r in np.broadcast_arrays(*grid.ratios)]
-    if float(stated.markov):
-        # Beside less of it than stated, which is none, as much: in the cells that can hold it.
-        room = each[0] == 0
-        level = np.stack(each)[:, room]
-        level[2:] = [[float(stated.markov)], [float(stated.constant)]]
-        each = [np.concatenate([a, b]) for a, b in zip(each, level, strict=True)]
-        prior = np.concatenate([prior, prior[room]])
-    ratios = NoiseRatios(*(np.append(float(a), b) for a, b in zip(stated, each, strict=True)))
-    return grid._replace(ratios=ratios, log_prior=np.concatenate([[0.0], prior]))
-
-
 def _with_noise_estimated(estimate: Estimate) -> Estimate | None:
     """The fit with its noise estimated: less than a model states would be whitened too far, and look quantised.
 
@@ -363,11 +228,6 @@ def _with_noise_estimated(estimate: Estimate) -> Estimate | None:
         return fit_record(estimate.record, free)
     except EstimateError:
         return None
-
-
-def _unfinished(selection: Selection) -> bool:
-    """Whether structure is left that would pass for a kind of noise."""
-    return selection.driver is not None or bool(selection.remains)
 
 
 def _like_hops(selection: Selection, free: Estimate) -> bool:
@@ -401,7 +261,7 @@ def _p_value(selection: Selection, nulls: np.ndarray) -> float:
     return float((1 + np.sum(nulls >= first.significance)) / (1 + len(nulls)))
 
 
-def _gain(session: _Session, baseline: Estimate, selection: Selection, unit: str, scale: float, ordinary, say) -> Gain:
+def _gain(session: Session, baseline: Estimate, selection: Selection, unit: str, scale: float, ordinary, say) -> Gain:
     if not any(f.effect is not None or f.frees_noise for f in selection.found):
         return no_gain(session.record, baseline, unit, scale)
 
@@ -410,7 +270,7 @@ def _gain(session: _Session, baseline: Estimate, selection: Selection, unit: str
     cells = sorted({g for ranking in rankings for g in cells_of_weight(ranking, FOLD_NEARBY)})
 
     def select(rows: np.ndarray, base: Estimate) -> Estimate:
-        return _Session(session.scanner.without(rows, cells), session.threshold).run(base, noise=noise).estimate
+        return Session(session.scanner.without(rows, cells), base, session.threshold).run(noise=noise).estimate
 
     return nested_gain(
         session.record,
@@ -423,7 +283,7 @@ def _gain(session: _Session, baseline: Estimate, selection: Selection, unit: str
     )
 
 
-def _rounds(session: _Session, selection: Selection, scale: float, hold_out: bool) -> tuple[Round, ...]:
+def _rounds(session: Session, selection: Selection, scale: float, hold_out: bool) -> tuple[Round, ...]:
     steps: list[tuple[Found | None, Ranking, Estimate]] = [
         (f, f.ranking, e) for f, e in zip(selection.path, selection.estimates[1:], strict=False)
     ]

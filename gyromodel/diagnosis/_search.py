@@ -46,6 +46,11 @@ class Selection:
     unresolved: str = ""
     beside_it: Estimate | None = field(default=None, repr=False)
 
+    @property
+    def unfinished(self) -> bool:
+        """Whether structure is left that would pass for a kind of noise."""
+        return self.driver is not None or bool(self.remains)
+
 
 def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selection:
     """Add candidates until nothing more is significant.

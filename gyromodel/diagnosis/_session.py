@@ -1,0 +1,170 @@
+"""A search laid out on one record, and the searches that may stand in for it: smoothed, weighted, without an axis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gyromodel._checks import CampaignError, thermometers
+from gyromodel.campaign import Campaign
+from gyromodel.diagnosis._bank import build_bank
+from gyromodel.diagnosis._data import Data, read
+from gyromodel.diagnosis._gain import ladder_error
+from gyromodel.diagnosis._misfit import unexplained_axes
+from gyromodel.diagnosis._scan import Scanner
+from gyromodel.diagnosis._search import Progress, Selection, search, significant_driver, steadied
+from gyromodel.diagnosis._steps import EXCHANGE, NoisePath, Steps, standing
+from gyromodel.diagnosis._variance import with_variance
+from gyromodel.estimate import Estimate, EstimateError, fit_record
+from gyromodel.model import GyroModel, record_span
+from gyromodel.noise import NoiseGrid, NoiseRatios, noise_grid
+from gyromodel.signals import Record, with_columns_known, with_smooth_thermometers
+
+# Nats that noise of thermometers may have cost from which on they are smoothed and searched again: it is an estimate.
+LOST = 0.5
+
+
+class Session:
+    """One record with its search laid out beside a fitted simulation: what the main pass and every fold do alike."""
+
+    def __init__(self, scanner: Scanner, baseline: Estimate, threshold: float) -> None:
+        self.record, self.scanner, self.baseline, self.threshold = scanner.record, scanner, baseline, threshold
+        self._ladder: dict[int, tuple[float, float, bool]] = {}
+
+    def ladder(self, estimate: Estimate) -> tuple[float, float, bool]:
+        """Held-out rms, log score and weighting of an estimate's structure, computed once."""
+        if id(estimate) not in self._ladder:
+            self._ladder[id(estimate)] = ladder_error(estimate.record, estimate)
+        return self._ladder[id(estimate)]
+
+    @property
+    def steps(self) -> Steps:
+        """What tries steps of this search."""
+        return Steps(self.scanner, self.baseline, self.threshold)
+
+    def run(self, progress: Progress = None, noise: NoisePath = ()) -> Selection:
+        """The rounds."""
+        return search(replace(self.steps, noise=noise), progress)
+
+    def pruned(self, selection: Selection) -> Selection:
+        """The rounds, cut where (after the first step) the error on blocks left out stops falling."""
+        for i in range(2, len(selection.estimates)):
+            # Two that show only together are judged together.
+            step, first = selection.path[i - 1], i - 1 - selection.path[i - 2].paired
+            now, before = self.ladder(selection.estimates[i]), self.ladder(selection.estimates[first])
+            if first and not step.paired and step.effect is not None and now[0] > before[0] and now[1] < before[1]:
+                path, estimates = selection.path[:first], selection.estimates[: first + 1]
+                found, ranking = tuple(standing(path)), step.ranking
+                # What was cut may have stood for a driver that was ahead of it.
+                driver = significant_driver(ranking, self.threshold)
+                if driver and ranking.statistic[driver] < ranking.statistic[step.name] + EXCHANGE:
+                    driver = None
+                cut = Selection(
+                    estimates[-1],
+                    found,
+                    path,
+                    ranking,
+                    estimates,
+                    driver,
+                    remains=step.name,
+                    beside_it=selection.estimates[i],
+                )
+                return steadied(self.steps, cut)
+        return selection
+
+
+def laid_out(record: Record, model: GyroModel, threshold: float, step: float = 0.0) -> Session:
+    """A search on a record; `step`: of the coarsest reading that its output is computed from.
+
+    Raises:
+        EstimateError: the simulation cannot be fitted.
+    """
+    baseline = fit_record(record, model)
+    grid = _grid(record, baseline)
+    return Session(
+        Scanner(record, build_bank(record), grid, stated=baseline.noise_given, step=step), baseline, threshold
+    )
+
+
+def over_smooth_thermometers(
+    session: Session, selection: Selection, model: GyroModel, say: Progress
+) -> tuple[Session, Selection] | None:
+    """The search over smoothed thermometers, where their noise may cost evidence and the data are explained better so.
+
+    Noise of a thermometer is none of what it measures: all that smooths, a lag or a narrow loop, would take it away.
+    """
+    record = with_smooth_thermometers(session.record)
+    if _lost_to_thermometers(session, record, selection) < LOST:
+        return None
+    try:
+        smooth = laid_out(record, model, session.threshold)
+    except EstimateError:
+        return None
+    other = smooth.run(say)
+    better = other.found and smooth.steps.fits_better(other.found, selection.found, EXCHANGE, session.steps)
+    return (smooth, other) if better else None
+
+
+def _lost_to_thermometers(session: Session, smooth: Record, selection: Selection) -> float:
+    """The evidence (nats) that noise of thermometers may cost the model, what was found or what might have been."""
+    measured = session.record
+    here, lost = measured.present, [0.0]
+    for estimate in (session.baseline, selection.estimate):
+        before, after = (np.asarray(estimate.model.predict(r.signals))[: r.rows][here] for r in (measured, smooth))
+        lost.append(0.5 * float(np.sum((after - before) ** 2)) / estimate.white_variance)
+    first = selection.path[0].ranking if selection.path else selection.last
+    for name in thermometers(measured.signals):
+        before, after = (np.asarray(r.signals[name])[: r.rows][here] for r in (measured, smooth))
+        share = np.var(after - before) / max(np.var(before), np.finfo(float).tiny)
+        lost.append(float(share) * max(first.statistic.values()))
+    return max(lost)
+
+
+def without_axis(
+    measured: Sequence[Campaign], axis: str, model: GyroModel, threshold: float, say: Progress
+) -> tuple[Data, Session, Selection] | None:
+    """The search of a platform's runs about other axes, if there are any and what it finds explains them."""
+    try:
+        data = read(measured, without=axis)
+        record, _ = with_columns_known(data.record)
+        session = laid_out(record, model, threshold, data.step)
+    except (CampaignError, EstimateError):
+        return None
+    selection = session.run(say)
+    explained = selection.found and not unexplained_axes(selection.estimate)
+    return (data, session, selection) if explained else None
+
+
+def over_weighted(
+    session: Session, white: np.ndarray, model: GyroModel, say: Progress
+) -> tuple[Session, Selection] | None:
+    """The search of samples weighted by their noise levels, where it leaves no structure that passes for a level."""
+    record, scanner = with_variance(session.record, white), session.scanner
+    try:
+        baseline = fit_record(record, model)
+    except EstimateError:
+        return None
+    weighted = Scanner(record, scanner.bank, scanner.grid, stated=baseline.noise_given, step=scanner.step)
+    again = Session(weighted, baseline, session.threshold)
+    selection = again.run(say)
+    return None if selection.unfinished else (again, selection)
+
+
+def _grid(record: Record, baseline: Estimate) -> NoiseGrid:
+    """Noise cells: the whole family; where the model states its noise, that cell first."""
+    grid = noise_grid(int(record.present.sum()), record.interval, record_span(record))
+    if not baseline.noise_given:
+        return grid
+    stated, prior = baseline.ratios, grid.log_prior
+    each = [np.asarray(r) for r in np.broadcast_arrays(*grid.ratios)]
+    if float(stated.markov):
+        # Beside less of it than stated, which is none, as much: in the cells that can hold it.
+        room = each[0] == 0
+        level = np.stack(each)[:, room]
+        level[2:] = [[float(stated.markov)], [float(stated.constant)]]
+        each = [np.concatenate([a, b]) for a, b in zip(each, level, strict=True)]
+        prior = np.concatenate([prior, prior[room]])
+    ratios = NoiseRatios(*(np.append(float(a), b) for a, b in zip(stated, each, strict=True)))
+    return grid._replace(ratios=ratios, log_prior=np.concatenate([[0.0], prior]))
