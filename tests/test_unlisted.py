@@ -141,6 +141,16 @@ def test_a_measured_heat_of_a_torquer_is_temperature(noise: float, rng: np.rando
     assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["bias_temperature"])
 
 
+def test_noise_of_a_thermometer_is_nothing_that_a_simulation_lacks(rng: np.random.Generator):
+    """All that smooths explains it where the bias over temperature is known: a loop as narrow as the noise, a lag."""
+    inside = chamber(rng)
+    shift = inside - inside.mean()
+    measured = log(400.0 * 0.05 / np.linalg.norm(shift) * shift, rng,
+                   temperature=inside + 0.5 * rng.standard_normal(len(TIME)))  # fmt: skip
+    found = gm.diagnose(measured, gm.model_from_effects(["bias", "bias_temperature"]), hold_out=False)
+    assert (found.verdict, found.causes, found.driver) == ("adequate", (), None)
+
+
 def test_a_thermometer_is_smoothed_where_its_noise_is_its_own_alone(rng: np.random.Generator):
     inside = chamber(rng)
     noisy = inside + 0.5 * rng.standard_normal(len(TIME))

@@ -103,7 +103,8 @@ def over_smooth_thermometers(
     except EstimateError:
         return None
     other = smooth.run(say)
-    better = other.found and smooth.steps.fits_better(other.found, selection.found, EXCHANGE, session.steps)
+    some = other.found or selection.found
+    better = some and smooth.steps.fits_better(other.found, selection.found, EXCHANGE, session.steps)
     return (smooth, other) if better else None
 
 

@@ -149,8 +149,12 @@ class Steps:
     def fits_better(
         self, found: Sequence[Found], other: Sequence[Found], by: float = 0.0, of: Steps | None = None
     ) -> bool:
-        """Whether some steps fit better by so many nats than others, of this search or another, on what both keep."""
-        given_up = Found("", None, rows_of([*found, *other]), found[0].ranking)
+        """Whether some steps fit better by so many nats than others, of this search or another, on what both keep.
+
+        One of both may be none at all.
+        """
+        each = [*found, *other]
+        given_up = Found("", None, rows_of(each), each[0].ranking)
         one, two = (s.fit([*steps, given_up]) for s, steps in ((self, found), (of or self, other)))
         return one is not None and (two is None or bool(_quality(one) > _quality(two) + by))
 
