@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import gyromodel as gm
-from gyromodel.diagnosis import _diagnose
+from gyromodel.diagnosis import _session
 from gyromodel.diagnosis._gain import held_out
 from gyromodel.estimate import fit_record
 from gyromodel.model import record_span
@@ -93,7 +93,7 @@ def test_what_one_block_alone_determines_is_not_cut(rng: np.random.Generator):
 def test_values_beside_what_was_cut_say_so(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch):
     """A cut by force: the coefficient over temperature takes up a part of the leans, and what it would be is told."""
     forced = lambda record, estimate: (p := float(len(estimate.model.slots())), -p, False)  # noqa: E731
-    monkeypatch.setattr(_diagnose, "ladder_error", forced)
+    monkeypatch.setattr(_session, "ladder_error", forced)
     found = gm.diagnose(log(rng, throughout=True), gm.model_from_effects(["scale_factor", "bias"]))
     assert [c.effect for c in found.causes] == ["bias_temperature"]
     (said,) = (line for line in found.findings if line.startswith("More remains"))

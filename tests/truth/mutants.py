@@ -22,11 +22,11 @@ def mutated(name: str) -> Iterator[None]:
 def _patches(name: str) -> dict[str, Any]:
     if not name:
         return {}
-    from gyromodel.diagnosis import _diagnose, _scan
+    from gyromodel.diagnosis import _diagnose, _scan, _session
     from gyromodel.diagnosis._evidence import log_evidence_ratio
     from gyromodel.estimate import fit_record
 
-    run_many, grid = _scan.Scanner.run_many, _diagnose.noise_grid
+    run_many, grid = _scan.Scanner.run_many, _session.noise_grid
 
     def white_only(samples: int, interval: float, span: float) -> Any:
         return grid(1, interval, span)
@@ -49,7 +49,7 @@ def _patches(name: str) -> dict[str, Any]:
 
     forced = {"_diagnose.SAFE_THRESHOLD": -1e9, "_search.MAXIMUM_ROUNDS": 1}
     return {
-        "no_whitening": {"_diagnose.noise_grid": white_only},
+        "no_whitening": {"_session.noise_grid": white_only},
         "no_projection": {"_scan.Scanner.run_many": nothing_projected},
         "no_look_elsewhere": {
             "_scan.log_mean_of_parts": best_of_parts,
