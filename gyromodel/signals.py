@@ -257,7 +257,10 @@ def thermometer_rate(record: Record, temperature: np.ndarray) -> np.ndarray:
 
 
 def with_smooth_thermometers(record: Record) -> Record:
-    """The record with every thermometer as the spline has it whose slope its rate is."""
+    """The record with every thermometer as the spline has it whose slope its rate is.
+
+    Where the spline varies less than the readings about it, it may be shaped by them alone: their mean takes its place.
+    """
     signals = dict(record.signals)
     for name in thermometers(signals):
         measured = np.asarray(signals[name])
@@ -285,7 +288,12 @@ def _thermometer_rate(time: np.ndarray, temperature: np.ndarray) -> np.ndarray:
 
 def _smooth_thermometer(time: np.ndarray, temperature: np.ndarray) -> np.ndarray:
     """The smoothed thermometer, each stretch by itself."""
-    return _by_stretch(time, temperature, smooth_values, temperature.copy())
+
+    def of(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+        smooth = smooth_values(time, values)
+        return smooth if np.var(smooth) > np.var(values - smooth) else np.full(len(values), values.mean())
+
+    return _by_stretch(time, temperature, of, temperature.copy())
 
 
 def _by_stretch(

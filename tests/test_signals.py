@@ -9,7 +9,7 @@ import pytest
 from gyromodel._checks import CampaignError
 from gyromodel.campaign import Campaign
 from gyromodel.numerics.smoothing import smooth_derivative
-from gyromodel.signals import Record, padded_length, read_signals
+from gyromodel.signals import Record, padded_length, read_signals, with_smooth_thermometers
 
 ROWS, STEP = 256, 20.0
 
@@ -280,3 +280,15 @@ def test_runs_of_several_campaigns_are_counted_on_where_they_share_a_number():
     assert runs(one, one, one) == [1, 1, 2, 2, 3, 3]
     assert runs(two, two) == [1, 2, 3, 4]
     assert runs(two, [7.0] * 8) == [1, 2, 7, 7]
+
+
+def test_a_thermometer_of_noise_alone_is_smoothed_to_its_mean(rng: np.random.Generator):
+    """What a spline makes of noise is slow as drift is; a climb beneath the noise is kept, each stretch by itself."""
+    time = np.concatenate([STEP * np.arange(400), 1e5 + STEP * np.arange(400)])
+    climb = np.where(time > 9e4, 5.0 + 1e-4 * (time - 1e5), 0.0)
+    noise = 0.05 * rng.standard_normal(len(time))
+    record = read_signals(campaign(time, rng.standard_normal(len(time)), temperature=20.0 + climb + noise))
+    smooth = np.asarray(with_smooth_thermometers(record).signals["temperature"])[: record.rows]
+    apart = time < 9e4
+    assert smooth[apart] == pytest.approx(20.0 + noise[apart].mean(), abs=1e-6)
+    assert smooth[~apart] == pytest.approx((20.0 + climb)[~apart], abs=0.03)

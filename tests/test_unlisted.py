@@ -48,12 +48,13 @@ def test_what_follows_a_column_through_a_lag_is_told_of_that_column(leak: float,
     assert followed(measured, "bias_temperature") == "pressure[earlier]"
 
 
-@pytest.mark.long
-def test_a_scale_factor_that_warms_up_follows_rate_and_time(rng: np.random.Generator):
-    """No step, no drift, and no set of anomalous dwells: an exponential of 30 standard deviations."""
+@pytest.mark.parametrize("climb", [0.0, 1.0])
+def test_a_scale_factor_that_warms_up_follows_rate_and_time(climb: float, rng: np.random.Generator):
+    """No step, no drift, no set of anomalous dwells, and nothing over what a thermometer's noise is smoothed to."""
     rate = np.tile(np.repeat([0.0, 50.0, -50.0, 100.0, -100.0, 0.0], 10), 20)
     warming = 1.2e-6 * 3600.0 * rate * np.exp(-TIME / 2700.0)
-    measured = log(3600.0 * rate + 5.0 + warming, rng, rate=rate, temperature=60 + 0.05 * rng.standard_normal(1200))
+    temperature = 60 + climb * TIME / TIME[-1] + 0.05 * rng.standard_normal(1200)
+    measured = log(3600.0 * rate + 5.0 + warming, rng, rate=rate, temperature=temperature)
     assert followed(measured, "scale_factor") == "rate and time"
 
 

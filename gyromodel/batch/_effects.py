@@ -16,7 +16,7 @@ import pyarrow as pa
 from scipy.special import expit, logsumexp
 
 from gyromodel.batch._units import Spread, copies, spread_of
-from gyromodel.diagnosis import SAFE_THRESHOLD, UNLISTED
+from gyromodel.diagnosis import SAFE_THRESHOLD, UNLISTED, special_cases
 
 SHARES = (np.arange(50) + 0.5) / 50
 # Of the posterior, that of a name which stands alone.
@@ -71,15 +71,22 @@ def _of(axis: str, campaigns: pd.DataFrame) -> list[PooledEffect]:
     named: dict[str, set[str]] = {}
     columns = (campaigns[name] for name in ("serial", "verdict", "causes", "evidence"))
     for serial, verdict, causes, evidence in zip(*columns, strict=True):
-        unit = units.setdefault(serial, {})
-        for name, logs in json.loads(evidence).items():
+        unit, held = units.setdefault(serial, {}), causes.split(", ")
+        logs = {name: np.array(each) for name, each in json.loads(evidence).items()}
+        for name, each in logs.items():
             names.setdefault(name)
-            unit[name] = unit.get(name, 0.0) + np.array(logs)
+            # What was told beside its special case is that and more.
+            within = [logs[s] for s in special_cases(name) if s in held and s in logs and name not in held]
+            unit[name] = unit.get(name, 0.0) + each + (np.max(within, axis=0) if within else 0.0)
         if verdict == "named":
-            for name in causes.split(", "):
+            for name in held:
                 named.setdefault(name, set()).add(serial)
     found = [_pooled(name, axis, units, len(named.get(name, ()))) for name in names]
     weight = np.array([e.evidence - UNLISTED * e.effect.startswith("smooth(") for e in found])
+    # A special case that does as well is enough.
+    of = dict(zip(names, weight, strict=True))
+    enough = [any(of.get(s, -np.inf) >= of[name] for s in special_cases(name)) for name in names]
+    weight[enough] = -np.inf
     posterior = np.exp(weight - logsumexp(weight)) if len(found) else weight
     order = np.argsort(-weight, kind="stable")
     return [found[i]._replace(posterior=float(posterior[i])) for i in order]

@@ -4,7 +4,7 @@ from gyromodel.diagnosis._added_tests import AddedTest, added_tests
 from gyromodel.diagnosis._diagnose import diagnose
 from gyromodel.diagnosis._evidence import SAFE_THRESHOLD
 from gyromodel.diagnosis._isolation import Isolability, Size, isolability
-from gyromodel.diagnosis._ranking import UNLISTED
+from gyromodel.diagnosis._ranking import UNLISTED, special_cases
 from gyromodel.diagnosis._result import (
     Candidate,
     Cause,
@@ -35,4 +35,5 @@ __all__ = [
     "added_tests",
     "diagnose",
     "isolability",
+    "special_cases",
 ]

@@ -169,9 +169,10 @@ def is_noise(name: str) -> bool:
     return name.startswith("noise_")
 
 
-def supersedes(name: str) -> tuple[str, ...]:
+def special_cases(name: str) -> tuple[str, ...]:
     """The special cases that a candidate contains."""
-    return () if name == "outliers" or is_noise(name) else effect_class(name).supersedes
+    listed = name != "outliers" and not is_driver(name) and not is_noise(name)
+    return effect_class(name).supersedes if listed else ()
 
 
 def rank(

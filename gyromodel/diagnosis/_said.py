@@ -9,7 +9,7 @@ import numpy as np
 from gyromodel._checks import listed
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._lines import lines_of
-from gyromodel.diagnosis._ranking import is_driver, supersedes
+from gyromodel.diagnosis._ranking import is_driver, special_cases
 from gyromodel.diagnosis._result import CREDIBLE, VAGUE
 from gyromodel.diagnosis._search import Selection
 from gyromodel.diagnosis._steps import Found, Steps
@@ -158,7 +158,7 @@ def _close_rival(step: Found, told: set[str]) -> str | None:
     statistic = step.ranking.statistic
     rivals = {k: v for k, v in statistic.items() if k not in (step.name, "outliers") and not is_driver(k)}
     rival = max(rivals, key=lambda k: rivals[k], default=None)
-    if rival is None or rival in told or step.name in supersedes(rival) or rival in supersedes(step.name):
+    if rival is None or rival in told or step.name in special_cases(rival) or rival in special_cases(step.name):
         return None
     lead = statistic.get(step.name, np.inf) - rivals[rival]
     if not 0 <= lead < -np.log(1.0 / CREDIBLE - 1.0):

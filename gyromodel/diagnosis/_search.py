@@ -51,6 +51,11 @@ class Selection:
         """Whether structure is left that would pass for a kind of noise."""
         return self.driver is not None or bool(self.remains)
 
+    @property
+    def followed(self) -> float:
+        """The evidence (nats) of what follows the driver; none without one."""
+        return self.last.statistic[self.driver] if self.driver else 0.0
+
 
 def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selection:
     """Add candidates until nothing more is significant.

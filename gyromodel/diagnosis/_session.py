@@ -104,7 +104,9 @@ def over_smooth_thermometers(
         return None
     other = smooth.run(say)
     some = other.found or selection.found
-    better = some and smooth.steps.fits_better(other.found, selection.found, EXCHANGE, session.steps)
+    # What only follows a column was found too, if not named.
+    ahead = EXCHANGE + selection.followed - other.followed
+    better = some and smooth.steps.fits_better(other.found, selection.found, ahead, session.steps)
     return (smooth, other) if better else None
 
 

@@ -15,7 +15,7 @@ from gyromodel.diagnosis._causes import cause_of
 from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._exchange import uncontested
 from gyromodel.diagnosis._points import levels
-from gyromodel.diagnosis._ranking import SLOW_IN_TIME, TIME_MARGIN, Ranking, is_driver, is_noise, supersedes
+from gyromodel.diagnosis._ranking import SLOW_IN_TIME, TIME_MARGIN, Ranking, is_driver, is_noise, special_cases
 from gyromodel.diagnosis._result import CREDIBLE, VAGUE, Cause, ParameterValue, Verdict
 from gyromodel.diagnosis._said import told, told_of_cause, told_of_rest
 from gyromodel.diagnosis._scan import Scanner
@@ -91,7 +91,7 @@ def credible(
     # A special case that does as well is enough. Where what was found contains it and does better, but not surely, both
     # stand: whether there is more than the special case is then not known.
     for k in list(chosen):
-        general = next((m for m in chosen if m not in (k, name) and k in supersedes(m)), None)
+        general = next((m for m in chosen if m not in (k, name) and k in special_cases(m)), None)
         if general and k in chosen:
             loser = min((k, general), key=lambda n: (n == name, chosen[n]))
             chosen[general if loser == k else k] += chosen.pop(loser)
