@@ -116,11 +116,20 @@ def table(rng: np.random.Generator) -> np.ndarray:
 
 @pytest.mark.parametrize("at", [0.35, 0.6])
 def test_a_level_that_switches_with_temperature_follows_temperature(at: float, rng: np.random.Generator):
-    """A laser that hops between two modes: several steps in time, one cause."""
+    """A laser that hops between two modes: several steps in time, one cause; or two breakpoints right at the hop."""
     inside = chamber(rng)
-    hop = inside > inside.min() + at * np.ptp(inside)
-    measured = log(0.5 + 0.1 * hop, rng, temperature=inside + 0.01 * rng.standard_normal(len(TIME)))
-    assert followed(measured) == "temperature"
+    level = inside.min() + at * np.ptp(inside)
+    measured = log(0.5 + 0.1 * (inside > level), rng, temperature=inside + 0.01 * rng.standard_normal(len(TIME)))
+    found = gm.diagnose(measured, gm.model_from_effects(["bias"]), hold_out=False)
+    if found.verdict == "named":
+        [cause] = found.causes
+        assert cause.effect == "bias_temperature_curve"
+        first, second = (p.value for p in cause.parameters if p.name.startswith("breakpoints"))
+        assert first < level < second < first + 2.0
+    else:
+        assert (found.verdict, found.causes) == ("unknown", ())
+        assert found.driver is not None
+        assert found.driver.column == "temperature"
 
 
 def test_the_heat_of_a_torquer_follows_what_the_rate_was(rng: np.random.Generator):
