@@ -214,10 +214,12 @@ def log(late: float, gyros: bool, seed: int) -> gyromodel.Campaign:
 
 @pytest.mark.long
 def test_the_commands_name_what_was_simulated(seed: int):
+    """The delay to a twentieth: its interval is linear, and bends with the friction of a gimbal that hardly turns."""
     diagnosis = gyromodel.diagnose(log(0.002, False, seed), model_from_effects([]), hold_out=False)
     assert {cause.effect for cause in diagnosis.causes} == {"sync_delay", "shaft_friction"}
     (delay,) = [row for row in diagnosis.extended.table() if row.name == "delay"]
-    assert abs(delay.value - 2.0) < 4 * delay.std + 0.01
+    assert abs(delay.value - 2.0) < 0.1
+    assert delay.std < 0.05
 
 
 def test_logged_gyros_see_how_friction_turns_the_body(seed: int):
