@@ -107,7 +107,7 @@ def _plan(seed: int, scale: float, controls: Sequence[str]) -> Iterator[tuple[st
     yield "drifts", study.drift_cases(few(INSEPARABLE), seed + 31), {}
     # With a safeguard off, and the same campaigns with it on.
     broken = study.null_cases(many(MUTATED), seed + 40, ("flicker_and_walk",), (A, B, C))
-    whole = study.effect_cases(many(MUTATED), seed + 41, 3.0)
+    whole = study.curve_cases(many(MUTATED), seed + 41, 3.0)
     more = study.null_cases(few(MUTATED), seed + 42)
     yield "broken", broken, {}
     yield "no_whitening", broken, {"mutant": "no_whitening"}

@@ -231,9 +231,14 @@ def null_cases(
 
 
 def effect_cases(count: int, seed: int, times_mde: float, noises: Iterable[str] = FAMILY[:3]) -> list[Case]:
-    """Catalogue effects in turn, each in its designs and noises in turn."""
+    """Catalogue effects in turn, each in its designs and noises in turn, from where the seed says."""
     names = sorted({e for d in HOMES for e in TESTABLE[d]})
     return _in_turn(count, seed, times_mde, tuple(noises), names, TESTABLE)
+
+
+def curve_cases(count: int, seed: int, times_mde: float, noises: Iterable[str] = FAMILY[:3]) -> list[Case]:
+    """As `effect_cases`, of curves whose larger part is a line, which the simulation has."""
+    return _in_turn(count, seed, times_mde, tuple(noises), ["bias_temperature_curve", "scale_nonlinearity"], TESTABLE)
 
 
 def unknown_cases(count: int, seed: int, times_mde: float, noises: Iterable[str] = FAMILY[:3]) -> list[Case]:
@@ -284,8 +289,8 @@ def _in_turn(
     names: list[str],
     homes: dict[str, tuple[str, ...]],
 ) -> list[Case]:
-    cases = []
-    for i, s in enumerate(_seeds(seed, count)):
+    cases, first = [], int(np.random.default_rng(seed).integers(10**6))
+    for i, s in enumerate(_seeds(seed, count), start=first):
         effect, lap = names[i % len(names)], i // len(names)
         designs = [d for d in HOMES if effect in homes.get(d, ())]
         cells = [
