@@ -111,6 +111,12 @@ def test_a_special_case_is_named_only_where_it_is_enough(bent: int):
     assert leading(pooled_effects(units)) == [causes[-1]]
 
 
+@pytest.mark.parametrize("name", ["bias_temperature_rate", "gimbal_nonorthogonality"])
+def test_what_takes_in_another_of_its_kind_is_no_special_case_of_itself(name: str):
+    units = table([{name: evidence(5.0), "bias_drift": evidence(0.5)}] * 4)
+    assert leading(pooled_effects(units)) == [name]
+
+
 SAID = {
     "bias_magnetic in": ({"bias_magnetic": 4.0, "bias_drift": 0.0}, "The simulation lacks bias_magnetic in"),
     "rivals": ({"bias_magnetic": 4.0, "table_tilt": 4.0}, "is missing that bias_magnetic or table_tilt explains"),
@@ -165,7 +171,7 @@ def test_effects_too_weak_for_a_campaign_are_named_over_eight(seed: int):
         named, wrong = named + (answer in right), wrong + (answer not in {*right, "", "?"})
         alone += sum(row["verdict"] == "named" and row["causes"] in right for row in rows)
     assert named >= binom.ppf(1e-4, len(those), 0.8), f"seed {seed}: {named} of {len(those)}"
-    assert wrong <= binom.isf(1e-4, len(those), 0.01), f"seed {seed}: {wrong} of {len(those)}"
+    assert wrong <= 1, f"seed {seed}: {wrong} of {len(those)}"
     assert alone < 8 * named, f"seed {seed}"
     still = archives(3, seed + 1, 0.0)
     assert not any(together(work(a)) for a in still), f"seed {seed}"

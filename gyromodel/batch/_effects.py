@@ -85,7 +85,7 @@ def _of(axis: str, campaigns: pd.DataFrame) -> list[PooledEffect]:
     weight = np.array([e.evidence - UNLISTED * e.effect.startswith("smooth(") for e in found])
     # A special case that does as well is enough.
     of = dict(zip(names, weight, strict=True))
-    enough = [any(of.get(s, -np.inf) >= of[name] for s in special_cases(name)) for name in names]
+    enough = [any(s != name and of.get(s, -np.inf) >= of[name] for s in special_cases(name)) for name in names]
     weight[enough] = -np.inf
     posterior = np.exp(weight - logsumexp(weight)) if len(found) else weight
     order = np.argsort(-weight, kind="stable")
