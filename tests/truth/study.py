@@ -237,7 +237,7 @@ def effect_cases(count: int, seed: int, times_mde: float, noises: Iterable[str] 
 
 
 def curve_cases(count: int, seed: int, times_mde: float, noises: Iterable[str] = FAMILY[:3]) -> list[Case]:
-    """As `effect_cases`, of curves whose larger part is a line, which the simulation has."""
+    """As `effect_cases`, of curves that the simulated bias and scale factor take up in part."""
     return _in_turn(count, seed, times_mde, tuple(noises), ["bias_temperature_curve", "scale_nonlinearity"], TESTABLE)
 
 
