@@ -423,7 +423,7 @@ def test_sizes_are_told_of_the_parameter_that_has_a_value():
 
 
 def test_sizes_said_to_be_detectable_are_some_standard_uncertainties():
-    """ln B reaches 4 at some 3.5 to 4.5 of least squares in white noise, and 0.84 more are 80 % of campaigns."""
+    """ln B reaches 3 at some 3.3 to 4.2 of least squares in white noise, and 0.84 more are 80 % of campaigns."""
     rng, time = np.random.default_rng(2), np.arange(ROWS) * 1.0
     temperature = 25 + 10 * np.sin(2 * np.pi * time / 20)
     found = gm.diagnose(

@@ -13,7 +13,6 @@ from gyromodel._checks import listed
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._calibrate import null_scores, threshold_of
 from gyromodel.diagnosis._data import read
-from gyromodel.diagnosis._evidence import SAFE_THRESHOLD
 from gyromodel.diagnosis._gain import nested_gain, no_gain, not_measured
 from gyromodel.diagnosis._isolation import settling_test
 from gyromodel.diagnosis._misfit import excess_band, unexplained_axes
@@ -76,7 +75,7 @@ def diagnose(
     record, left_out = with_columns_known(record)
     findings += left_out
     say("fitting the simulation", 0.02)
-    session = laid_out(record, model, SAFE_THRESHOLD, data.step)
+    session = laid_out(record, model, step=data.step)
     nulls = np.zeros(0)
     if calibrate:
         nulls = null_scores(session.scanner, session.baseline, calibrate, seed, say)

@@ -13,10 +13,16 @@ import numpy as np
 
 SIZES = np.array([1e1, 1e2, 1e3, 1e4])
 # ln of the evidence ratio that noise alone exceeds less than once in a hundred campaigns; see benchmarks/threshold.py.
-SAFE_THRESHOLD = 4.0
+# With ν degrees of freedom it is FEW/ν more: noise that by chance leaves next to nothing of few residuals.
+SAFE_THRESHOLD, FEW = 3.0, 8.0
 # Data sets whose evidence is worked out at once: as many as stay in the processor's cache. Of more than these B is
 # read from so many nodes, whose error is below 1e-4 while ln B stays this small.
 SETS_TOGETHER, NODES, SMALL = 8, 4096, 100.0
+
+
+def safe_threshold(nu: int) -> float:
+    """The safe threshold of a campaign with ν degrees of freedom."""
+    return SAFE_THRESHOLD + FEW / max(nu, 1)
 
 
 def log_evidence_ratio(t: np.ndarray, rss: np.ndarray | float, nu: int, q: np.ndarray | int) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._added_tests import added_tests
 from gyromodel.diagnosis._bank import PART_OF, build_bank
-from gyromodel.diagnosis._evidence import SAFE_THRESHOLD, explained_for
+from gyromodel.diagnosis._evidence import explained_for, safe_threshold
 from gyromodel.diagnosis._forms import step_at
 from gyromodel.diagnosis._ranking import skipped
 from gyromodel.diagnosis._scan import epochs_of
@@ -227,15 +227,12 @@ class Isolability:
         }
 
 
-def isolability(
-    campaign: Campaign, model: GyroModel, threshold: float = SAFE_THRESHOLD, *, tests: bool = True
-) -> Isolability:
+def isolability(campaign: Campaign, model: GyroModel, *, tests: bool = True) -> Isolability:
     """Which effects a campaign could show and tell apart, at what size, before any output is measured.
 
     Args:
         campaign: its columns; the output is not used.
         model: what the simulation contains, with its noise stated.
-        threshold: least ln evidence ratio of a finding.
         tests: whether further tests are tried.
 
     Raises:
@@ -246,12 +243,12 @@ def isolability(
     if not np.isfinite(float(model.gain())):
         raise ModelError("what can be told apart depends on the scale factor: state its value in the model")
     campaign = _output_known(campaign)
-    detectable, before, not_testable = _sizes([campaign], model, threshold)
+    detectable, before, not_testable = _sizes([campaign], model)
     # Pairs that are not told apart at the size that shows them are what a further test is for.
     in_doubt = [(a, b) for (a, b), size in before.items() if size.value > detectable[a].value]
     helped = []
     for test in added_tests(campaign) if tests else ():
-        after = _sizes([campaign, _output_known(test.campaign, 1)], model, threshold)[1]
+        after = _sizes([campaign, _output_known(test.campaign, 1)], model)[1]
         gained = sum(_nats(before[pair], after[pair]) for pair in in_doubt if pair in after)
         helped.append((gained, test.sentence, after))
     helped.sort(key=lambda item: -item[0])
@@ -264,7 +261,7 @@ def _nats(before: Size, after: Size) -> float:
 
 
 def _sizes(
-    campaigns: Sequence[Campaign], model: GyroModel, threshold: float
+    campaigns: Sequence[Campaign], model: GyroModel
 ) -> tuple[dict[str, Size], dict[tuple[str, str], Size], dict[str, str]]:
     """Sizes that are found, sizes that are told apart, and what is not testable."""
     record = with_columns_known(read_signals(campaigns))[0]
@@ -307,7 +304,7 @@ def _sizes(
     detectable = {}
     for name, columns in left.items():
         price = np.log(len(columns)) + bank.price(name)
-        needed = explained_for(threshold + price, nu, columns[0].shape[1])
+        needed = explained_for(safe_threshold(nu) + price, nu, columns[0].shape[1])
         detectable[name] = size(name, float(np.sqrt(needed)) + POWER)
     apart = {}
     for a, b in itertools.permutations(left, 2):

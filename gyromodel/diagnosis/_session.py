@@ -11,6 +11,7 @@ from gyromodel._checks import CampaignError, thermometers
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._data import Data, read
+from gyromodel.diagnosis._evidence import safe_threshold
 from gyromodel.diagnosis._gain import ladder_error
 from gyromodel.diagnosis._misfit import unexplained_axes
 from gyromodel.diagnosis._scan import Scanner
@@ -75,17 +76,16 @@ class Session:
         return selection
 
 
-def laid_out(record: Record, model: GyroModel, threshold: float, step: float = 0.0) -> Session:
-    """A search on a record; `step`: of the coarsest reading that its output is computed from.
+def laid_out(record: Record, model: GyroModel, threshold: float | None = None, step: float = 0.0) -> Session:
+    """A search on a record, by the safe threshold if none is given; `step`: of the coarsest reading behind its output.
 
     Raises:
         EstimateError: the simulation cannot be fitted.
     """
     baseline = fit_record(record, model)
-    grid = _grid(record, baseline)
-    return Session(
-        Scanner(record, build_bank(record), grid, stated=baseline.noise_given, step=step), baseline, threshold
-    )
+    scanner = Scanner(record, build_bank(record), _grid(record, baseline), stated=baseline.noise_given, step=step)
+    safe = safe_threshold(baseline.degrees_of_freedom)
+    return Session(scanner, baseline, safe if threshold is None else threshold)
 
 
 def over_smooth_thermometers(

@@ -23,7 +23,7 @@ SECOND_THERMOMETER, ANY_ACCELERATION = "temperature_<place>", "acceleration_<axi
 # … and the angles of a vibration test, which effects of a platform see in parts of their own.
 TABLE_ANGLES, GIMBAL_ANGLES = "table_<axis>", "gimbal_<axis>"
 # Prior odds on what every gyro has, against what some have.
-EVERY_GYRO = 10.0
+EVERY_GYRO = 5.0
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ def _patches(name: str) -> dict[str, Any]:
 
         return _diagnose.nested_gain(session.record, baseline, select, unit, scale, ordinary)
 
-    forced = {"_diagnose.SAFE_THRESHOLD": -1e9, "_search.MAXIMUM_ROUNDS": 1}
+    forced = {"_session.safe_threshold": lambda nu: -1e9, "_search.MAXIMUM_ROUNDS": 1}
     return {
         "no_whitening": {"_session.noise_grid": white_only},
         "no_projection": {"_scan.Scanner.run_many": nothing_projected},
