@@ -31,6 +31,7 @@ from gyromodel.diagnosis._evidence import (
     explained_for,
     log_evidence_ratio,
     log_mean_evidence,
+    safe_threshold,
 )
 from gyromodel.diagnosis._forms import step_at
 from gyromodel.diagnosis._pairs import best_pair
@@ -168,6 +169,14 @@ def test_evidence_ratio_is_the_integral_over_the_amplitude() -> None:
         ratios.append(constant * value)
     expected = np.log(np.mean(ratios))
     assert float(log_evidence_ratio(np.array(t), rss, nu, 1)) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("nu", [2, 3, 4, 6, 10, 30, 100, 1000])
+@pytest.mark.parametrize("columns", [1, 2])
+def test_noise_alone_passes_the_safe_threshold_as_seldom_in_few_samples(nu: int, columns: int) -> None:
+    """Of white noise, columns explain a part that follows a beta law; not where they leave nothing."""
+    part = explained_for(safe_threshold(nu), nu, columns) / nu
+    assert stats.beta.sf(part, columns / 2, max(nu - columns, 1) / 2) < 1e-3
 
 
 def test_explained_for_inverts_the_evidence() -> None:
