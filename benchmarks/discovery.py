@@ -146,7 +146,7 @@ def main(argv: list[str] | None = None) -> None:
         if not kept.seconds:
             kept.seconds = _timed(args.seed + 70)
             kept.save()
-    found = [Kept(path) for path in sorted(args.kept.glob("seed_*.json.gz"))]
+    found = [Kept(path) for path in sorted(args.kept.glob("seed_*.json.gz"), key=lambda path: int(path.stem[5:-5]))]
     whole = [k for k in found if k.seconds]
     # Of one engine: this one, where it has been studied.
     whole = [k for k in whole if k.code == code()] or whole
