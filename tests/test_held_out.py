@@ -10,12 +10,14 @@ import pytest
 
 import gyromodel as gm
 from gyromodel.diagnosis import _session
-from gyromodel.diagnosis._gain import held_out
+from gyromodel.diagnosis._gain import _summary, folds_of, held_out
 from gyromodel.estimate import fit_record
 from gyromodel.model import record_span
 from gyromodel.noise import NoiseRatios
 from gyromodel.signals import read_signals
 from tests.test_diagnosis import dense_covariance
+from tests.truth.gains import true_gain
+from tests.truth.study import Case, build
 
 RUNS, ROWS = 4, 80
 # Of the temperature's bias (deg/s/°C), and of the input axis towards two cross rates (rad).
@@ -113,3 +115,32 @@ def test_friction_that_one_run_of_each_axis_shows_is_not_cut():
     assert {cause.effect for cause in found.causes} == {"sync_delay", "shaft_friction"}
     (delay,) = (p for c in found.causes for p in c.parameters if p.name == "delay")
     assert abs(delay.value - 2.0) < 4 * delay.std < 0.02
+
+
+def test_blocks_alike_by_chance_do_not_make_a_gain_known_better_than_noise_leaves_it():
+    """Of 1000 errors of white noise and a signal of λ = 14 the ratio has a standard deviation of λ/n."""
+    before, after, scores = np.full(5, 1.196), np.full(5, 1.0), np.full(5, 19.6)
+    gain = _summary(before, after, scores, 1000, "fifths", "deg/h", 1.0)
+    assert np.log(gain.ci95[1] / gain.ratio) == pytest.approx(1.96 * 0.014, rel=1e-3)
+    assert np.array(gain.log_score_ci95) == pytest.approx(98.0 + 1.96 * 14.0 * np.array([-1, 1]), rel=1e-3)
+
+
+@pytest.mark.parametrize("effect", ["bias_pressure", "bias_turn_on"])
+def test_the_true_gain_of_the_study_is_that_of_least_squares_on_average(effect: str, rng: np.random.Generator):
+    """Fits drawn many times, their columns written out; no run's own offset is known of a run left out."""
+    case = Case(7, "repeated_runs" if effect == "bias_turn_on" else "static_cycle", "white", effect, 3.0)
+    built = build(case)
+    wrong, spread, true = built.truth.error, built.truth.noise.std(), built.design.true
+    run = true.get("run", np.zeros(len(wrong)))
+    own = run[:, None] == np.unique(run)[1:] if effect == "bias_turn_on" else true["pressure"][:, None]
+    simulated = np.ones((len(wrong), 1))
+    folds = folds_of(read_signals(gm.Campaign(columns=built.columns, units=built.units, metadata=built.metadata)))[0]
+    squares = np.zeros(2)
+    for _ in range(60):
+        output = (wrong + spread * rng.standard_normal(len(wrong))) / spread
+        for rows in folds:
+            others = np.setdiff1d(np.arange(len(wrong)), rows)
+            for i, columns in enumerate((simulated, np.column_stack([simulated, own]))):
+                fitted = np.linalg.lstsq(columns[others], output[others], rcond=1e-9)[0]
+                squares[i] += np.mean((output[rows] - columns[rows] @ fitted) ** 2)
+    assert np.sqrt(squares[0] / squares[1]) == pytest.approx(true_gain(case), rel=0.02)

@@ -82,7 +82,10 @@ def _least(steps: Steps, ranking: Ranking, name: str) -> float:
 def _chosen_again(
     steps: Steps, found: list[Found], estimate: Estimate
 ) -> tuple[list[Found], Estimate, dict[int, Ranking]]:
-    """One pass: each addition exchanged for a better one given all the others, but for noise, which only may go."""
+    """One pass: each addition exchanged for a better one given all the others, but for noise, which only may go.
+
+    A better one may be another form of the same: which was best had been judged with less beside it.
+    """
     rankings: dict[int, Ranking] = {}
     for i in range(len(found) if len(found) > 1 else 0):
         if not found[i].weighed or uncontested(found[i]) or (rest := steps.all_but(found, i)) is None:
@@ -95,13 +98,14 @@ def _chosen_again(
         lines = any(f.name == "bias_periodic" for f in others)
         name, score = ranking.best(drivers=False, but=("bias_periodic",) if lines else ())
         own = ranking.statistic.get(found[i].name, -np.inf)
+        reshaped = name == found[i].name and steps.scanner.bank.structures(found[i].name) > 1
         if (
             name is None
             # It went with what it grew from, which the others do not hold.
             or found[i].name not in ranking.statistic
             or is_noise(name)
-            or name in (found[i].name, "outliers")
-            or score < max(own + EXCHANGE, steps.least(ranking, name))
+            or name == "outliers"
+            or not (reshaped or score >= max(own + EXCHANGE, steps.least(ranking, name)))
         ):
             continue
         step = steps.step(others, base, ranking, name)

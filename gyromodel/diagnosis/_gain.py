@@ -118,7 +118,7 @@ def nested_gain(
         ordinary: whether the model before and the one after are used with ordinary weights.
         progress: called with folds done and in all.
     """
-    before, after, scores = [], [], []
+    before, after, scores, number = [], [], [], 0
     folds, scheme = folds_of(record)
     for k, rows in enumerate(folds):
         try:
@@ -131,11 +131,12 @@ def nested_gain(
         before.append(np.mean(e0**2))
         after.append(np.mean(e1**2))
         scores.append(s1 - s0)
+        number += len(e0)
         if progress:
             progress(k + 1, len(folds))
     if lost := len(folds) - len(scores):
         scheme += f" ({lost} more could not be predicted)"
-    return _summary(np.array(before), np.array(after), np.array(scores), scheme, unit, scale)
+    return _summary(np.array(before), np.array(after), np.array(scores), number, scheme, unit, scale)
 
 
 def _errors(record: Record, train: Estimate, rows: np.ndarray, ordinary: bool) -> tuple[np.ndarray, float]:
@@ -146,7 +147,10 @@ def _errors(record: Record, train: Estimate, rows: np.ndarray, ordinary: bool) -
     return errors, score
 
 
-def _summary(before, after, scores, scheme: str, unit: str, scale: float) -> Gain:
+def _summary(
+    before: np.ndarray, after: np.ndarray, scores: np.ndarray, number: int, scheme: str, unit: str, scale: float
+) -> Gain:
+    """The gain of folds with so many errors in all: their mean squares before and after, and gains in log score."""
     folds = len(scores)
     if folds < 2:
         return Gain(
@@ -162,12 +166,15 @@ def _summary(before, after, scores, scheme: str, unit: str, scale: float) -> Gai
         )
     rms = float(np.sqrt(before.mean()) * scale), float(np.sqrt(after.mean()) * scale)
     ratio = rms[0] / rms[1] if rms[1] > 0 else 1.0
-    # Jackknife over blocks for the ratio, Student's t over blocks for the log score.
+    # Jackknife over blocks for the ratio, Student's t over blocks for the log score; few blocks may be alike by chance,
+    # so neither is taken to be known better than white noise of that many errors leaves it.
     logs = np.array([0.5 * np.log(np.delete(before, k).mean() / np.delete(after, k).mean()) for k in range(folds)])
     spread = np.sqrt((folds - 1) / folds * np.sum((logs - logs.mean()) ** 2))
-    t = float(stats.t.ppf(0.975, folds - 1))
+    t, z = float(stats.t.ppf(0.975, folds - 1)), float(stats.norm.ppf(0.975))
     total, error = float(scores.sum()), float(np.sqrt(folds) * scores.std(ddof=1))
-    interval = (float(ratio * np.exp(-t * spread)), float(ratio * np.exp(t * spread)))
+    half = max(t * spread, z * np.sqrt(np.expm1(2.0 * abs(np.log(ratio))) / number))
+    error = max(t * error, z * np.sqrt(2.0 * abs(total)))
+    interval = (float(ratio * np.exp(-half)), float(ratio * np.exp(half)))
     return Gain(
         rms[0],
         rms[1],
@@ -177,7 +184,7 @@ def _summary(before, after, scores, scheme: str, unit: str, scale: float) -> Gai
         f"nested, one of {folds} {scheme}",
         folds,
         total,
-        (total - t * error, total + t * error),
+        (total - error, total + error),
     )
 
 

@@ -89,6 +89,8 @@ class Steps:
                 model = model.with_effect(step.effect)
         rows = rows_of(found)
         data = self.scanner.record.without(np.array(rows)) if rows else self.scanner.record
+        last = next((f for f in reversed(found) if f.effect is not None), None)
+        start = self.scanner.grid.ratios.take(last.ranking.best_cell(last.name)) if last else None
         model = replace(model, noise=self.baseline.model.noise if given else {})
         entangled = None
         for attempt in (model, _shapes_held(model, found)):
@@ -98,6 +100,7 @@ class Steps:
                     data,
                     attempt,
                     ratios=ratios,
+                    start=start,
                     markov="noise_markov" in freed if freed else None,
                     solver="levenberg_marquardt",
                 )

@@ -289,6 +289,7 @@ class ScaleSpline(Effect):
         "Repeat the rates both ways and in random order: anomalous test points and resonances do not come back alike."
     )
     supersedes = ("scale_nonlinearity",)
+    odds = 0.1  # what a low power of the rate tells as well is one
     untested = f"has fewer than ten different rates, or {EARTHLY}"
 
     coefficients: Float[Array, " bend"] = parameter("ppm", 100.0, "bends, as parts of the largest rate", default=())

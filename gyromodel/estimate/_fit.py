@@ -84,6 +84,7 @@ def fit_record(
     model: GyroModel,
     *,
     ratios: NoiseRatios | None = None,
+    start: NoiseRatios | None = None,
     markov: bool | None = None,
     solver: Solver = "auto",
     ordinary: bool = False,
@@ -94,6 +95,8 @@ def fit_record(
         record: the data.
         model: what to fit.
         ratios: noise ratios to hold instead of estimating them.
+        start: noise ratios to begin with; none: white noise, in which slow noise may pull shapes away for good, and
+            then those that were found.
         markov: whether the noise beside white is a Markov process, or flicker and walk; none: these, unless a Markov
             process is likelier by a margin.
         solver: see `fit`.
@@ -108,10 +111,31 @@ def fit_record(
     check_enough(record, len(model.slots()))
     given = given_ratios(record, model) if ratios is None else ratios
     white = NoiseRatios(jnp.zeros(()), jnp.zeros(()))
-    ratios = given if given is not None else white
+    estimate = _in_turns(record, model, given or start or white, given is None, markov, solver)
+    shapes = not all(slot.linear for slot in model.slots())
+    slow = any(float(r) > 0 for r in (estimate.ratios.flicker, estimate.ratios.walk, estimate.ratios.markov))
+    if given is None and start is None and shapes and slow:
+        try:
+            other = _in_turns(record, model, estimate.ratios, True, markov, solver)
+        except EstimateError:
+            other = estimate
+        estimate = max(estimate, other, key=lambda e: e.log_likelihood)
+    if ordinary:
+        # The noise is what generalised least squares leaves: ordinary residuals are larger.
+        filter = filter_of(record, white)
+        solution = solve(model, np.asarray(estimate.model.vector()), record, filter, solver)
+        filter = filter_of(record, estimate.ratios)
+        estimate = _finish(record, model, estimate.ratios, filter, solution, variance=estimate.white_variance)
+    return estimate
+
+
+def _in_turns(
+    record: Record, model: GyroModel, ratios: NoiseRatios, free: bool, markov: bool | None, solver: Solver
+) -> Estimate:
+    """Parameters in the noise to begin with, then noise and parameters in turns if it is free."""
     filter = filter_of(record, ratios)
     solution = solve(model, np.asarray(model.vector()), record, filter, solver, linear_first=True)
-    for turn in range(0 if given is not None else 4):
+    for turn in range(4 if free else 0):
         before = ratios
         now = model.with_vector(jnp.asarray(solution.x))
         ratios = best_ratios(record, now, coarse=turn == 0, start=before, markov=markov)
@@ -119,12 +143,7 @@ def fit_record(
         solution = solve(model, solution.x, record, filter, solver)
         if turn and settled(before, ratios):
             break
-    estimate = _finish(record, model, ratios, filter, solution)
-    if ordinary:
-        # The noise is what generalised least squares leaves: ordinary residuals are larger.
-        solution = solve(model, solution.x, record, filter_of(record, white), solver)
-        estimate = _finish(record, model, ratios, filter, solution, variance=estimate.white_variance)
-    return estimate
+    return _finish(record, model, ratios, filter, solution)
 
 
 def check_enough(record: Record, parameters: int) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.stats import beta, binom, kstest
 
 from .campaigns import TESTABLE
+from .gains import true_gain
 from .noise import FAMILY, OUTSIDE
 from .study import SLOW, Record
 from .verdicts import Score, allowed
@@ -321,13 +322,13 @@ POSITIONED = ("tumble", "one_axis_tumble")
 
 
 def gain_coverage(records: list[Record]) -> list[Level]:
-    """Row 15: in white noise the error of a sample falls by sqrt(1 + lambda^2/n) when the right effect is added."""
+    """Row 15: whether the interval of the gain holds what adding the right effect gains on average in white noise."""
     hits = []
     for r in records:
         white = r.case.noise == "white" and r.case.design not in POSITIONED
         if r.answer and r.score and r.score.named and white:
             _, low, high = r.answer.gain_ratio
-            hits.append(bool(low <= np.sqrt(1 + r.size**2 / r.rows) <= high))
+            hits.append(bool(low <= true_gain(r.case) <= high))
     measure = "gain interval covers the true gain, white noise"
     return [_level("15", measure, "–", 0.88, True, hits), _level("15", measure, "–", 0.99, False, hits)]
 
