@@ -117,12 +117,18 @@ def test_friction_that_one_run_of_each_axis_shows_is_not_cut():
     assert abs(delay.value - 2.0) < 4 * delay.std < 0.02
 
 
-def test_blocks_alike_by_chance_do_not_make_a_gain_known_better_than_noise_leaves_it():
-    """Of 1000 errors of white noise and a signal of λ = 14 the ratio has a standard deviation of λ/n."""
-    before, after, scores = np.full(5, 1.196), np.full(5, 1.0), np.full(5, 19.6)
-    gain = _summary(before, after, scores, 1000, "fifths", "deg/h", 1.0)
-    assert np.log(gain.ci95[1] / gain.ratio) == pytest.approx(1.96 * 0.014, rel=1e-3)
-    assert np.array(gain.log_score_ci95) == pytest.approx(98.0 + 1.96 * 14.0 * np.array([-1, 1]), rel=1e-3)
+@pytest.mark.parametrize("signal", [14.0, 500.0])
+def test_blocks_alike_by_chance_do_not_make_a_gain_known_better_than_noise_leaves_it(
+    signal: float, rng: np.random.Generator
+):
+    """The ratio's scatter over draws of white noise, with a signal of so many standard deviations in 1000 errors."""
+    n, draws = 1000, rng.standard_normal((4000, 1000))
+    power, before = np.sum(draws**2, axis=1), np.sum((draws + signal / np.sqrt(n)) ** 2, axis=1)
+    mean = 1.0 + signal**2 / n
+    gain = _summary(np.full(5, mean), np.ones(5), np.full(5, signal**2 / 10), n, "fifths", "deg/h", 1.0)
+    half = 1.96 * np.std(0.5 * np.log(before / power))
+    assert np.log(gain.ci95[1] / gain.ratio) == pytest.approx(half, rel=0.1)
+    assert np.array(gain.log_score_ci95) == pytest.approx(0.5 * signal**2 + 1.96 * signal * np.array([-1, 1]), rel=1e-3)
 
 
 @pytest.mark.parametrize("effect", ["bias_pressure", "bias_turn_on"])

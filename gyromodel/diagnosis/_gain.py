@@ -172,7 +172,7 @@ def _summary(
     spread = np.sqrt((folds - 1) / folds * np.sum((logs - logs.mean()) ** 2))
     t, z = float(stats.t.ppf(0.975, folds - 1)), float(stats.norm.ppf(0.975))
     total, error = float(scores.sum()), float(np.sqrt(folds) * scores.std(ddof=1))
-    half = max(t * spread, z * np.sqrt(np.expm1(2.0 * abs(np.log(ratio))) / number))
+    half = max(t * spread, z * np.sqrt(-np.expm1(-4.0 * abs(np.log(ratio))) / (2.0 * number)))
     error = max(t * error, z * np.sqrt(2.0 * abs(total)))
     interval = (float(ratio * np.exp(-half)), float(ratio * np.exp(half)))
     return Gain(
