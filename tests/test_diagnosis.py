@@ -573,6 +573,27 @@ def test_two_causes_are_named_exactly(case: study.Case) -> None:
     assert set(answer.causes) == set(case.effect.split("+"))
 
 
+# Beside what was hidden, noise shows another effect with ln B = 3.75 and 3.61.
+ALONE = [
+    study.Case(1542242366881524, "static_cycle", "flicker", "bias_pressure", 3.0),
+    study.Case(538442349364852, "rate_temperature", "random_walk", "scale_temperature", 3.0),
+]
+
+
+@pytest.mark.parametrize("case", ALONE, ids=lambda case: case.effect)
+def test_a_further_cause_needs_more_than_the_first(case: study.Case) -> None:
+    answer = study.run_engine(study.build(case))
+    assert (answer.verdict, answer.causes) == ("named", (case.effect,))
+
+
+def test_what_follows_a_column_ahead_of_all_further_names_is_unknown() -> None:
+    """A ripple over temperature that a loop leads, after which a name of 4 nats is tried ahead of a driver of 14."""
+    answer = study.run_engine(
+        study.build(study.Case(4018702520113736, "rate_temperature", "flicker", "temperature_ripple", 10.0))
+    )
+    assert (answer.verdict, answer.driver) == ("unknown", ("temperature",))
+
+
 def test_two_names_stay_where_neither_holds_the_other() -> None:
     """A bias of 16 and a temperature-rate bias of 5 standard deviations, which share nothing."""
     rows, rng = 2000, np.random.default_rng(3)

@@ -24,6 +24,8 @@ Progress = Callable[[str, float], None] | None
 MAXIMUM_ROUNDS = 12
 # More steps than this are a function of time that nobody explains by naming each.
 MAXIMUM_STEPS = 3
+# Nats that a further cause needs more than the first: of something wrong one cause is likelier than two.
+FURTHER = 1.0
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,7 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
         for more in (f.name for f in path if f.grows and f.name not in lost):
             if ranking.statistic.get(more, -np.inf) > score - DOUBT:
                 name, score = more, ranking.statistic[more]
-        if name is None or not _significant(steps, ranking, name, score):
+        if name is None or not _significant(steps, ranking, name, score - FURTHER * bool(path)):
             both = _together(steps, path, estimate, ranking)
             if not both or len(path) + 2 > MAXIMUM_ROUNDS or any(unresolved(e, f, scanner.step) for f, e in both):
                 break
@@ -120,6 +122,13 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
             if other.found:
                 return other
         return Selection(steps.baseline, (), (), path[0].ranking, (steps.baseline,), driver)
+    for i in range(1, len(path)):
+        if driver := _ahead_of(path[i:], threshold):
+            before, ranking = path[:i], path[i].ranking
+            selection = Selection(
+                estimates[i], tuple(standing(before)), tuple(before), ranking, tuple(estimates[: i + 1]), driver
+            )
+            return steadied(steps, selection)
     found, left_out = standing(path), {}
     if sum(f.weighed for f in found) > 1:
         before = found
@@ -156,6 +165,15 @@ def steadied(steps: Steps, selection: Selection) -> Selection:
         remains="bias_periodic",
         unresolved=said,
     )
+
+
+def _ahead_of(further: list[Found], threshold: float) -> str | None:
+    """A driver that, where further names were begun with, surely explains more than all of these together."""
+    driver = significant_driver(further[0].ranking, threshold)
+    if driver is None or any(f.points or f.frees_noise for f in further):
+        return None
+    lead = further[0].ranking.statistic[driver] - sum(f.ranking.statistic[f.name] for f in further)
+    return driver if lead > DOUBT else None
 
 
 def _lead(steps: Steps, driver: str, path: list[Found], last: Ranking) -> float:
