@@ -16,9 +16,11 @@ import pyarrow as pa
 from scipy.special import expit, logsumexp
 
 from gyromodel.batch._units import Spread, copies, spread_of
-from gyromodel.diagnosis import SAFE_THRESHOLD, UNLISTED, special_cases
+from gyromodel.diagnosis import UNLISTED, special_cases
 
 SHARES = (np.arange(50) + 0.5) / 50
+# Least ln B of an effect that is pooled: an archive is asked of every effect on every axis.
+POOLED_THRESHOLD = 4.0
 # Of the posterior, that of a name which stands alone.
 CERTAIN = 0.95
 
@@ -109,7 +111,7 @@ def _pooled(name: str, axis: str, units: dict[str, dict[str, np.ndarray]], alone
 
 def leading(effects: Sequence[PooledEffect]) -> list[str]:
     """Names of one axis that hold 95 % of the posterior; none where the first has too little evidence."""
-    if not effects or effects[0].evidence < SAFE_THRESHOLD:
+    if not effects or effects[0].evidence < POOLED_THRESHOLD:
         return []
     held = np.cumsum([e.posterior for e in effects])
     return [e.effect for e in effects[: int(np.searchsorted(held, CERTAIN)) + 1]]
@@ -128,7 +130,7 @@ def _sentence(effects: Sequence[PooledEffect]) -> str:
     if not alike:
         return (
             f"All units together show nothing that was searched: the strongest is {top.effect}, with ln B = "
-            f"{top.evidence:.1f} of the {SAFE_THRESHOLD:g} needed."
+            f"{top.evidence:.1f} of the {POOLED_THRESHOLD:g} needed."
         )
     share = f"{top.share.value:.0%} ({top.share.low:.0%} to {top.share.high:.0%}) of {len(top.probability)} units"
     if len(alike) > 1:

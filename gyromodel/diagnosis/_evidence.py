@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 SIZES = np.array([1e1, 1e2, 1e3, 1e4])
-# ln of the evidence ratio that noise alone exceeds less than once in a hundred campaigns; see benchmarks/threshold.py.
+# ln of the evidence ratio that noise alone exceeds in 0.8 % of campaigns of the demo's design (flicker, and no bias
+# simulated: 2.7 %); see benchmarks/threshold.py.
 # With ν degrees of freedom it is FEW/ν more: noise that by chance leaves next to nothing of few residuals.
 SAFE_THRESHOLD, FEW = 3.0, 8.0
 # Data sets whose evidence is worked out at once: as many as stay in the processor's cache. Of more than these B is

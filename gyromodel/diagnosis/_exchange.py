@@ -113,7 +113,11 @@ def _chosen_again(
         if len(standing(changed)) < len(changed):
             continue
         after = steps.fit(changed)
-        if after is None or not steps.keeps(base, step, after) or not steps.fits_better(changed, found):
+        if (
+            after is None
+            or not steps.keeps(base, step, after)
+            or not steps.fits_better(changed, found, EXCHANGE * reshaped)
+        ):
             continue
         if not unresolved(after, step, steps.scanner.step):
             found, estimate, rankings = changed, after, {i: ranking}

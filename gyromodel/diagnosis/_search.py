@@ -123,7 +123,7 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
                 return other
         return Selection(steps.baseline, (), (), path[0].ranking, (steps.baseline,), driver)
     for i in range(1, len(path)):
-        if driver := _ahead_of(path[i:], threshold):
+        if not path[i - 1].paired and (driver := _ahead_of(path[i:], threshold)):
             before, ranking = path[:i], path[i].ranking
             selection = Selection(
                 estimates[i], tuple(standing(before)), tuple(before), ranking, tuple(estimates[: i + 1]), driver
