@@ -76,7 +76,7 @@ def pytest_runtest_makereport(item: pytest.Item):
 def seed(request: pytest.FixtureRequest) -> int:
     """A seed that differs between runs, tests and tries; GYROMODEL_TEST_SEED repeats a run."""
     name = int.from_bytes(request.node.nodeid.encode(), "big")
-    run = [int(os.environ["GYROMODEL_TEST_SEED"]), name, *range(1, request.node.execution_count)]
+    run = [int(os.environ["GYROMODEL_TEST_SEED"]), name, *range(1, getattr(request.node, "execution_count", 1))]
     return int(np.random.SeedSequence(run).generate_state(1)[0])
 
 
