@@ -3,7 +3,7 @@ against its dense formula, and estimates against simulators that share no code w
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 
 import jax.numpy as jnp
 import numpy as np
@@ -213,7 +213,8 @@ def test_intervals_cover_independently_simulated_noise(rng: np.random.Generator)
     reach: dict[str, list[float]] = defaultdict(list)
     for seed in range(SEEDS):
         law = truth.draw(truth.FAMILY[seed % 4], design(ROWS), rng)
-        estimate = with_noise_intervals(fit_record(with_output(record, law.sample(design(ROWS), rng)), model))
+        estimate = fit_record(with_output(record, law.sample(design(ROWS), rng)), model, markov=False)
+        estimate = with_noise_intervals(estimate)
         for name, alpha in ids.items():
             level = law.white if alpha is None else law.fractional.get(alpha, 0.0)
             low, high = estimate.noise_interval[name]
@@ -229,6 +230,24 @@ def test_intervals_cover_independently_simulated_noise(rng: np.random.Generator)
     for name in ("noise_flicker", "noise_random_walk"):
         assert 0.1 < np.median(ratio[name]) < 1.7, ratio[name]
         assert np.median(reach[name]) < 4.0, reach[name]
+
+
+@pytest.mark.parametrize("N", [0.0, 4e-5])
+def test_intervals_of_markov_noise_hold_what_was_fitted_and_what_is_true(N: float, rng: np.random.Generator):
+    """With white noise beside it, and with none, when all ratios above some are as likely."""
+    record, model = with_rows(ROWS), model_from_effects(["bias"])
+    truths = {"noise_markov": 3e-6, "noise_markov_time": 80.0, "noise_white": N}
+    inside = Counter[str]()
+    for _ in range(8):
+        noise = truth.white(ROWS, STEP, N, rng) + truth.markov(ROWS, STEP, 3e-6, 80.0, rng)
+        estimate = with_noise_intervals(fit_record(with_output(record, noise), model, markov=True))
+        for name, true in truths.items():
+            low, high = estimate.noise_interval[name]
+            assert low * (1 - 1e-9) <= float(estimate.model.noise[name]) <= high * (1 + 1e-9), name
+            # The white noise of a ratio without end is small, not none.
+            inside[name] += low * (true > 0) <= true <= high
+    for name, hits in inside.items():
+        assert binom.cdf(hits, 8, 0.93) > 1e-4, (name, hits)
 
 
 def test_white_noise_shows_no_other(rng: np.random.Generator):

@@ -165,15 +165,15 @@ def _summary(
             (-np.inf, np.inf),
         )
     rms = float(np.sqrt(before.mean()) * scale), float(np.sqrt(after.mean()) * scale)
-    ratio = rms[0] / rms[1] if rms[1] > 0 else 1.0
+    ratio = rms[0] / rms[1] if min(rms) > 0 else 1.0
     # Jackknife over blocks for the ratio, Student's t over blocks for the log score; few blocks may be alike by chance,
     # so neither is taken to be known better than white noise of that many errors leaves it.
     logs = np.array([0.5 * np.log(np.delete(before, k).mean() / np.delete(after, k).mean()) for k in range(folds)])
     spread = np.sqrt((folds - 1) / folds * np.sum((logs - logs.mean()) ** 2))
     t, z = float(stats.t.ppf(0.975, folds - 1)), float(stats.norm.ppf(0.975))
     total, error = float(scores.sum()), float(np.sqrt(folds) * scores.std(ddof=1))
+    beside = max(t * error, z * np.sqrt(2.0 * abs(total)))
     half = max(t * spread, z * np.sqrt(-np.expm1(-4.0 * abs(np.log(ratio))) / (2.0 * number)))
-    error = max(t * error, z * np.sqrt(2.0 * abs(total)))
     interval = (float(ratio * np.exp(-half)), float(ratio * np.exp(half)))
     return Gain(
         rms[0],
@@ -184,7 +184,7 @@ def _summary(
         f"nested, one of {folds} {scheme}",
         folds,
         total,
-        (total - error, total + error),
+        (total - beside, total + beside),
     )
 
 

@@ -95,8 +95,9 @@ def fit_record(
         record: the data.
         model: what to fit.
         ratios: noise ratios to hold instead of estimating them.
-        start: noise ratios to begin with; none: white noise, in which slow noise may pull shapes away for good, and
-            then those that were found.
+        start: noise ratios to begin with. If none are given: white noise, and where shapes are fitted and slow noise
+            was found a second fit begins in that noise, as slow noise taken for white may pull shapes away for good;
+            the likelier of the two is returned.
         markov: whether the noise beside white is a Markov process, or flicker and walk; none: these, unless a Markov
             process is likelier by a margin.
         solver: see `fit`.

@@ -117,13 +117,14 @@ def with_noise_intervals(estimate: Estimate) -> Estimate:
     for turn, margin in enumerate((4.0, 2.0, 2.0, 2.0, 0.0)):
         result = restricted_likelihood(_mesh(levels), record.interval, span, record.sampling, jacobian, residual)
         below = result.log_likelihood.max() - result.log_likelihood
-        # Only levels even in amplitude are for splines.
+        # Only levels even in prominence are for splines.
         if not margin or (turn and np.sum(below < REJECTED) > 2 * INTERVAL_LEVELS):
             break
-        levels = [_levels(np.asarray(r), below < margin * REJECTED) for r in _mesh(levels)]
+        likely = below < margin * REJECTED
+        levels = [_levels(np.asarray(r), likely, float(b)) for r, b in zip(_mesh(levels), estimate.ratios, strict=True)]
     # A likelihood that falls off steeply would make splines swing where it does not.
-    likely = np.maximum(result.log_likelihood, result.log_likelihood.max() - HOPELESS * REJECTED)
-    finer, (log_likelihood, log_sum) = _finer(levels, likely, np.log(result.residual_sum))
+    hoped = np.maximum(result.log_likelihood, result.log_likelihood.max() - HOPELESS * REJECTED)
+    finer, (log_likelihood, log_sum) = _finer(levels, estimate.ratios, hoped, np.log(result.residual_sum))
     kept = log_likelihood.max() - log_likelihood < REJECTED
     white = np.exp(log_sum[kept]) / result.degrees_of_freedom
     ratios = _mesh(finer).take(kept)
@@ -134,22 +135,34 @@ def with_noise_intervals(estimate: Estimate) -> Estimate:
     return replace(estimate, noise_interval=spans)
 
 
-def _levels(ratio: np.ndarray, likely: np.ndarray) -> np.ndarray:
-    """Levels of one noise ratio, even in amplitude, from the one below its likely range to the one above."""
+def _prominence(ratio: np.ndarray, best: float) -> np.ndarray:
+    """Amplitude of one noise against the best one's, from zero to a half there and one where there is nothing else."""
+    amplitude = np.sqrt(ratio)
+    return amplitude / (amplitude + np.sqrt(best)) if best > 0 else amplitude
+
+
+def _ratio(prominence: np.ndarray, best: float) -> np.ndarray:
+    return (prominence / (1 - prominence)) ** 2 * best if best > 0 else prominence**2
+
+
+def _levels(ratio: np.ndarray, likely: np.ndarray, best: float) -> np.ndarray:
+    """Levels of one noise ratio, even in prominence, from the one below its likely range to the one above."""
     levels = np.unique(ratio)
     first, last = np.searchsorted(levels, [ratio[likely].min(), ratio[likely].max()])
-    low, high = levels[max(first - 1, 0)], levels[min(last + 1, len(levels) - 1)]
-    return np.unique(np.linspace(np.sqrt(low), np.sqrt(high), INTERVAL_LEVELS) ** 2)
+    ends = levels[[max(first - 1, 0), min(last + 1, len(levels) - 1)]]
+    return np.unique(_ratio(np.linspace(*_prominence(ends, best), INTERVAL_LEVELS), best))
 
 
-def _finer(levels: Sequence[np.ndarray], *values: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Levels closer together in amplitude, where there are several, and what cubic splines make of values there."""
-    amplitudes = [np.sqrt(r) for r in levels]
-    closer = [np.linspace(a[0], a[-1], FINER_LEVELS if len(a) > 1 else 1) for a in amplitudes]
+def _finer(
+    levels: Sequence[np.ndarray], best: NoiseRatios, *values: np.ndarray
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Levels closer together in prominence, where there are several, and what cubic splines make of values there."""
+    prominences = [_prominence(r, float(b)) for r, b in zip(levels, best, strict=True)]
+    closer = [np.linspace(p[0], p[-1], FINER_LEVELS if len(p) > 1 else 1) for p in prominences]
     made = []
     for value in values:
-        grid = value.reshape([len(a) for a in amplitudes])
-        for axis, (a, at) in enumerate(zip(amplitudes, closer, strict=True)):
-            grid = make_interp_spline(a, grid, k=min(3, len(a) - 1), axis=axis)(at)
+        grid = value.reshape([len(p) for p in prominences])
+        for axis, (p, at) in enumerate(zip(prominences, closer, strict=True)):
+            grid = make_interp_spline(p, grid, k=min(3, len(p) - 1), axis=axis)(at)
         made.append(grid.ravel())
-    return [a**2 for a in closer], made
+    return [_ratio(p, float(b)) for p, b in zip(closer, best, strict=True)], made
