@@ -150,7 +150,8 @@ def _levels(ratio: np.ndarray, likely: np.ndarray, best: float) -> np.ndarray:
     levels = np.unique(ratio)
     first, last = np.searchsorted(levels, [ratio[likely].min(), ratio[likely].max()])
     ends = levels[[max(first - 1, 0), min(last + 1, len(levels) - 1)]]
-    return np.unique(_ratio(np.linspace(*_prominence(ends, best), INTERVAL_LEVELS), best))
+    low, high = _prominence(ends, best)
+    return np.unique(_ratio(np.linspace(low, high, INTERVAL_LEVELS), best))
 
 
 def _finer(
