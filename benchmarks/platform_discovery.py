@@ -28,7 +28,7 @@ CLEAR = {
 TIMES = (1.0, 3.0, 10.0)
 ANSWERS = ("named", "in doubt, truth among", "unknown", "adequate", "wrong")
 # ln B of the safe threshold, what the sizes and the forms that are tried cost, and what makes 80 % of one half.
-NEEDED, PRICE, POWER = 4.0, 5.0, 0.84
+NEEDED, PRICE, POWER = 3.0, 5.0, 0.84
 
 
 def diagnosed(effect: str, size: float, seed: int):

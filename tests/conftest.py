@@ -21,6 +21,12 @@ import tests.typechecker  # noqa: F401  the import hook of pyproject.toml looks 
 
 ROOT = Path(__file__).resolve().parents[1]
 CACHE = ROOT / ".cache"
+# Whose tests hold what a search tells of one campaign, or of a few: not of each draw.
+VERDICTS = {f"test_{name}" for name in (
+    "archive_effects", "diagnosis", "fuzz", "held_out", "honesty", "isolation", "memory_effects", "misfit", "monitors",
+    "motion_effects", "noise_causes", "noise_identification", "platform_diagnosis", "poses", "report", "ring_laser",
+    "rounded_sweeps", "temperature_curves", "three_axes", "unlisted",
+)}  # fmt: skip
 
 # Set in the environment, so that test workers and the commands that tests start share them.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE / "jax"))
@@ -51,11 +57,11 @@ def pytest_report_header() -> str:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the longest, those of test_discovery.py, shared between two workers: each is dealt half, in order.
 
-    A test of random draws that fails is drawn anew, once, but those that count shares: what chance fails once in fifty
-    runs it hardly fails twice. What is wrong in some draws only shows less often; the summary tells which were.
+    A verdict of random draws that is not as a test has it is drawn anew, once: what chance fails once in fifty runs it
+    hardly fails twice. What is wrong in some draws only shows less often; the summary tells which were.
     """
     for item in items:
-        if "seed" in getattr(item, "fixturenames", ()) and "test_discovery" not in item.nodeid:
+        if "seed" in getattr(item, "fixturenames", ()) and Path(item.path).stem in VERDICTS:
             item.add_marker(pytest.mark.flaky(reruns=1))
     first = [item for item in items if "test_discovery" in item.nodeid and item.get_closest_marker("long")]
     rest = [item for item in items if item not in first]

@@ -171,12 +171,12 @@ def test_evidence_ratio_is_the_integral_over_the_amplitude() -> None:
     assert float(log_evidence_ratio(np.array(t), rss, nu, 1)) == pytest.approx(expected, rel=1e-6)
 
 
-@pytest.mark.parametrize("nu", [2, 3, 4, 6, 10, 30, 100, 1000])
+@pytest.mark.parametrize("nu", [4, 6, 10, 30, 100, 1000])
 @pytest.mark.parametrize("columns", [1, 2])
 def test_noise_alone_passes_the_safe_threshold_as_seldom_in_few_samples(nu: int, columns: int) -> None:
-    """Of white noise, columns explain a part that follows a beta law; not where they leave nothing."""
+    """Of white noise, columns explain a part that follows a beta law."""
     part = explained_for(safe_threshold(nu), nu, columns) / nu
-    assert stats.beta.sf(part, columns / 2, max(nu - columns, 1) / 2) < 1e-3
+    assert 1e-4 < stats.beta.sf(part, columns / 2, (nu - columns) / 2) < 1e-3
 
 
 def test_explained_for_inverts_the_evidence() -> None:
