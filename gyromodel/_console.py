@@ -69,6 +69,12 @@ def prepare_folder(folder: Path, model: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
 
 
+def refuse_suffix(target: Path, suffixes: Sequence[str]) -> None:
+    """Refuse a name that says no kind of file that can be written."""
+    if not target.name.lower().endswith(tuple(suffixes)):
+        raise typer.BadParameter(f"{target}: its name has to end in {' or '.join(suffixes)}", param_hint="--output")
+
+
 def refuse_overwriting(target: Path, inputs: Sequence[Path]) -> None:
     """Refuse to write over what is read."""
     for path in inputs:

@@ -6,6 +6,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import typer
+
 from gyromodel._console import print_table
 
 if TYPE_CHECKING:
@@ -17,9 +19,11 @@ def run_sensitivity(
     time: str | None, criterion: Any, rivals: list[str], sobol: bool, draws: int, seed: int,
 ) -> tuple[Sensitivity, dict[str, Any], PlanChoice | None]:  # fmt: skip
     """The study of the files, its result as plain data, and the best test plan where one was asked for."""
+    from gyromodel._checks import CampaignError
     from gyromodel.model_files import read_calibration
     from gyromodel.plan import read_plan
     from gyromodel.study import best_plan, known, read_candidates, read_instruments, seconds, sensitivity
+    from gyromodel.units import UnitError
 
     calibrated, mission = [read_calibration(path) for path in models], read_plan(plan)
     instruments = read_instruments(plan, mission)
@@ -27,6 +31,10 @@ def run_sensitivity(
     errors = read_instruments(design, other) if design and other else {}
     # What a wrong file says comes before the work.
     parts = read_candidates(candidates) if candidates else []
+    try:
+        budget = seconds(time) if parts else 0.0
+    except (CampaignError, UnitError) as error:
+        raise typer.BadParameter(str(error), param_hint="--budget") from None
     found = sensitivity(
         calibrated, mission, outcomes, design=other, instruments=instruments, design_instruments=errors,
         draws=draws, sobol=sobol, seed=seed,
@@ -38,7 +46,7 @@ def run_sensitivity(
     # Of three units alike, each is measured by itself.
     jacobian = leading.jacobian.reshape(-1, len(gyros.vector))
     choice = best_plan(
-        gyros, parts, seconds(time), criterion, jacobian=jacobian, rivals=rivals,
+        gyros, parts, budget, criterion, jacobian=jacobian, rivals=rivals,
         instruments=instruments if other is None else errors,
     )  # fmt: skip
     plain = {"criterion": choice.criterion, "gain": choice.gain}

@@ -25,6 +25,7 @@ from gyromodel._console import (
     read_campaigns,
     refusal,
     refuse_overwriting,
+    refuse_suffix,
 )
 from gyromodel._diagnose_files import REPORTS, diagnose_axes, diagnose_to
 
@@ -41,6 +42,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the machine-readable
 CampaignFile = Annotated[
     Path, typer.Option("--output", "-o", metavar="FILE", help="Campaign to write; its suffix says the kind.")
 ]
+SENSITIVITY = ("sensitivity.json", "tornado.svg", "budget.svg")
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of the random draws.")]
 
 
@@ -177,12 +179,15 @@ def simulate(
     if pattern_file is None or (like and plan):
         raise typer.BadParameter("give either --like CAMPAIGN or --plan PLAN.yaml", param_hint="--like")
     refuse_overwriting(output, [model, pattern_file])
-    from gyromodel.files import read_campaign, write_campaign
+    from gyromodel.files import SUFFIXES, read_campaign, write_campaign
     from gyromodel.model import simulate as simulate_campaign
     from gyromodel.model_files import read_model
     from gyromodel.plan import read_plan
 
+    refuse_suffix(output, SUFFIXES)
     simulated_by = read_model(model)
+    if not simulated_by.noise:
+        print(f"gyromodel: {model} states no noise, and none is drawn", file=sys.stderr)
     pattern = read_plan(pattern_file) if plan else read_campaign(pattern_file)
     simulated = simulate_campaign(simulated_by, pattern.axis(axis) if axis else pattern, seed)
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -265,15 +270,15 @@ def sensitivity(
         from gyromodel.report import history_figure, tornado_figure
 
         output.mkdir(parents=True, exist_ok=True)
-        write_text(output / "sensitivity.json", json_text(result))
-        write_text(output / "tornado.svg", tornado_figure(found))
-        write_text(output / "budget.svg", history_figure(found))
+        texts = json_text(result), tornado_figure(found), history_figure(found)
+        for name, text in zip(SENSITIVITY, texts, strict=True):
+            write_text(output / name, text)
     if as_json:
         print(json_text(result), end="")
         return
     print_sensitivity(found, chosen)
     if output:
-        print_paths(output, "sensitivity.json", "tornado.svg", "budget.svg")
+        print_paths(output, *SENSITIVITY)
 
 
 @app.command()
@@ -291,8 +296,10 @@ def compensate(
     """
     refuse_overwriting(output, [model, campaign])
     from gyromodel._compensate_files import compensate_to
+    from gyromodel.files import SUFFIXES
     from gyromodel.model_files import read_calibration
 
+    refuse_suffix(output, SUFFIXES)
     done, held = compensate_to(campaign, output, model, read_calibration(model), axis, force)
     if done.note:
         print(f"gyromodel: {done.note}", file=sys.stderr)
@@ -311,9 +318,10 @@ def navigate(
 ) -> None:
     """Navigate from a start at rest: add attitude, velocity and position to a campaign."""
     refuse_overwriting(output, [campaign])
-    from gyromodel.files import write_campaign
+    from gyromodel.files import SUFFIXES, write_campaign
     from gyromodel.platform import navigate_campaign
 
+    refuse_suffix(output, SUFFIXES)
     navigated = navigate_campaign(read_campaigns([campaign], None)[0])
     output.parent.mkdir(parents=True, exist_ok=True)
     write_campaign(navigated, output)
@@ -343,8 +351,7 @@ def batch(
 
     A campaign that cannot be read or fitted is a row with its reason, and the exit status is then 1.
     """
-    if output.suffix != ".parquet":
-        raise typer.BadParameter("the table is a Parquet file: end its name in .parquet", param_hint="--output")
+    refuse_suffix(output, [".parquet"])
     refuse_overwriting(output, [model, Path(archive)])
     from gyromodel._archive_files import batch_to
 
@@ -375,6 +382,7 @@ def units(
 ) -> None:
     """Tell how the units of an archive spread, which stand out or drift, and what all lack together."""
     if output:
+        refuse_suffix(output, [".parquet"])
         refuse_overwriting(output, [results])
     from gyromodel._archive_files import print_units, units_of
 

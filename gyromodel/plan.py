@@ -1,7 +1,7 @@
 """Campaigns that have not been measured yet, from a YAML plan of what every column is to do.
 
-A column is constant or a list of segments, whose last value stays; any key but the four below and `instruments`, the
-errors of columns, is metadata.
+A column is constant or a list of segments, whose last value stays; any key but the five of what is planned and
+`instruments`, the errors of columns, is metadata.
 
     gyro: fog
     kind: rate
@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import yaml
@@ -30,10 +30,31 @@ from gyromodel._checks import CampaignError
 from gyromodel.campaign import Campaign
 from gyromodel.units import UnitError, convertible, factor, from_internal, quantity, to_internal
 
-_KEYS = {"duration", "interval", "output", "columns"}
+_KEYS = {"duration", "interval", "kind", "output", "columns"}
 # What a plan may say besides, that is no metadata of the campaign.
 _APART = {"instruments"}
 _MOST_SAMPLES = 100_000_000
+
+
+class _Loader(yaml.SafeLoader):
+    """Dates stay text, as in all metadata."""
+
+    yaml_implicit_resolvers: ClassVar[Any] = {
+        first: [(tag, pattern) for tag, pattern in known if tag != "tag:yaml.org,2002:timestamp"]
+        for first, known in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+
+def read_yaml(path: Path) -> Any:
+    """A plan's file as it is written, dates as text.
+
+    Raises:
+        CampaignError: it is no YAML file.
+    """
+    try:
+        return yaml.load(path.read_text(encoding="utf-8"), _Loader)
+    except (yaml.YAMLError, ValueError) as error:
+        raise CampaignError(f"{path}: is no YAML file: {' '.join(str(error).split())}") from None
 
 
 def read_plan(path: str | Path) -> Campaign:
@@ -46,10 +67,7 @@ def read_plan(path: str | Path) -> Campaign:
         CampaignError: the file is no plan; the message names the key or the segment.
     """
     path = Path(path)
-    try:
-        plan = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise CampaignError(f"{path}: is no YAML file: {' '.join(str(error).split())}") from None
+    plan = read_yaml(path)
     missing = sorted(_KEYS - set(plan)) if isinstance(plan, dict) else sorted(_KEYS)
     if missing:
         raise CampaignError(f"{path}: a plan needs the keys {', '.join(sorted(_KEYS))}; missing: {', '.join(missing)}")
@@ -75,7 +93,7 @@ def planned(plan: Mapping[str, Any], name: str) -> Campaign:
     columns, units = {"time": time}, {"time": "s"}
     for column, course in ((str(key), value) for key, value in plan["columns"].items()):
         columns[column], units[column] = _course(f"column {column}", course, time)
-    metadata = {str(key): value for key, value in plan.items() if key not in _KEYS | _APART}
+    metadata = {str(key): value for key, value in plan.items() if key == "kind" or key not in _KEYS | _APART}
     unit = str(plan["output"])
     # A campaign is checked to hold measurements, which a plan has not: it passes with a stand-in, taken out again.
     campaign = Campaign(columns | {"output": time}, units | {"output": unit}, metadata, name)

@@ -25,6 +25,7 @@ from gyromodel.batch import _results as storage
 from gyromodel.batch import _run as running
 from gyromodel.batch import _work as work
 from gyromodel.batch._references import referred
+from gyromodel.batch._results import SCHEMA, Results
 from gyromodel.campaign import Campaign
 from gyromodel.estimate import fit
 from gyromodel.files import write_campaign
@@ -418,6 +419,10 @@ def test_what_commands_have_written_is_no_campaign(tmp_path: Path):
     for suffix in files.SUFFIXES:
         write_campaign(compensate(campaign(0), calibration), place / f"copy{suffix}")
     write_campaign(campaign(1).with_metadata({"navigated": "yes"}), place / "way.csv")
+    write_campaign(campaign(0), tmp_path / "group.zarr" / "one.zarr")
+    write_campaign(compensate(campaign(0), calibration), tmp_path / "group.zarr" / "two.zarr")
+    (tmp_path / "group.zarr" / ".zgroup").write_text('{"zarr_format": 2}')
+    assert [entry.campaign for entry in entries(str(tmp_path / "group.zarr"))] == ["one.zarr"]
     for pattern, count in ((None, 3), (place / "*.*", 2)):
         (place / "results.parquet").unlink(missing_ok=True)
         done = here(tmp_path, "archive/results.parquet", where=pattern)
@@ -482,6 +487,31 @@ def test_what_could_not_be_read_is_tried_again(tmp_path: Path, monkeypatch: pyte
         assert (here(tmp_path).failed, here(tmp_path).failed) == (2, 2)
     done = here(tmp_path)
     assert (done.examined, done.failed) == (1, 1)
+
+
+def test_one_axis_that_the_machine_has_failed_is_tried_again(tmp_path: Path):
+    row = dict.fromkeys(SCHEMA.names) | {"campaign": "c.csv"}
+    with Results(tmp_path / "results.parquet", {}) as kept:
+        kept.add([row | {"axis": "x", "file_state": ""}, row | {"axis": "y", "file_state": "10-20"}])
+        kept.flush()
+        assert kept.finished() == {"c.csv": ""}
+        kept.add([row | {"axis": axis, "file_state": "10-20"} for axis in "xy"])
+        kept.flush()
+        assert kept.finished() == {"c.csv": "10-20"}
+
+
+def test_an_archive_without_a_readable_campaign_goes_on_when_there_is_one(tmp_path: Path):
+    """The first temperature is then the reference; before, no campaign had any."""
+    place = tmp_path / "archive"
+    place.mkdir()
+    (tmp_path / "model.yaml").write_text(STATED)
+    (place / "c0.csv").write_text("time [s],temperature [degC],output [deg/h]\n0,20,1\n")
+    first = here(tmp_path)
+    assert (first.failed, first.references) == (1, {})
+    write_campaign(campaign(0), place / "c0.csv")
+    done = here(tmp_path)
+    assert (done.failed, set(done.references)) == (0, {"bias_temperature.reference"})
+    assert here(tmp_path).examined == 0
 
 
 def test_a_run_that_ends_meanwhile_is_no_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -52,6 +52,12 @@ def test_repeats_end_with_the_plan_and_names_may_be_numbers(tmp_path: Path):
     assert campaign.units["1"] == "V"
 
 
+@pytest.mark.parametrize("date", ["2024-05-01", "2024-02-30"])
+def test_dates_are_text(tmp_path: Path, date: str):
+    (tmp_path / "plan.yaml").write_text(f"date: {date}\n{HEAD}  rate: 1 deg/s\n", encoding="utf-8")
+    assert read_plan(tmp_path / "plan.yaml").metadata["date"] == date
+
+
 @pytest.mark.parametrize(
     ("columns", "expected"),
     [
@@ -77,7 +83,8 @@ def test_mistakes_are_named_where_they_are(tmp_path: Path, columns: str, expecte
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("", "missing: columns, duration, interval, output"),
+        ("", "missing: columns, duration, interval, kind, output"),
+        (HEAD.replace("kind: rate\n", ""), "missing: kind"),
         (HEAD.replace("duration: 1 min\n", ""), "missing: duration"),
         (HEAD.replace("10 s", "1e-9 s") + "  rate: 0 deg/s\n", "samples"),
         ("a: [", "is no YAML file"),

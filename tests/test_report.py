@@ -30,7 +30,7 @@ from gyromodel.estimate import Estimate
 from gyromodel.estimate._estimate import ParameterRow
 from gyromodel.report import sentence, with_uncertainty, write_report
 from gyromodel.report._numbers import number, pair, percent, unit_text
-from gyromodel.report._series import bins, explained, thinned
+from gyromodel.report._series import abscissae, bins, explained, thinned
 from gyromodel.report._words import PHRASES
 
 Make = Callable[..., Diagnosis]
@@ -475,6 +475,26 @@ def test_residuals_are_drawn_over_every_driver_and_the_cause_first(rng: np.rando
     names = [path.stem for path in write_report(named_static(rng, 3000), tmp_path)[1:]]
     assert {"residual-phase", "residual-supply-voltage", "residual-temperature-coil"} <= set(names)
     assert "constant" in "".join(read(tmp_path / "report.html").text)
+
+
+def test_drawings_of_others_are_left_alone(rng: np.random.Generator, tmp_path: Path):
+    (tmp_path / "figures").mkdir()
+    for name in ("mine.svg", "residual-old.svg"):
+        (tmp_path / "figures" / name).write_text("<svg/>")
+    write_report(named(rng), tmp_path)
+    assert (tmp_path / "figures" / "mine.svg").read_text() == "<svg/>"
+    assert not (tmp_path / "figures" / "residual-old.svg").exists()
+
+
+def test_thermometers_in_other_units_differ_by_temperatures(rng: np.random.Generator):
+    diagnosis = named_static(rng, 3000)
+    true = rng.normal(0.0, 1.0, 3000)
+    warmer = diagnosis.campaign.columns["temperature"] - true
+    campaign = diagnosis.campaign.with_column("temperature_coil", 32 + 1.8 * warmer, "degF")
+    found, _ = abscissae(replace(diagnosis, campaign=campaign, residual_before=true))
+    [difference] = [x for x in found if x.key == "temperature:difference:temperature_coil"]
+    assert difference.unit == "degC"
+    assert difference.values == pytest.approx(true)
 
 
 def test_an_unknown_shows_the_function_it_follows(rng: np.random.Generator, tmp_path: Path):

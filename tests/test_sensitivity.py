@@ -41,6 +41,7 @@ from gyromodel.study import (
     sobol_indices,
     symmetric_factor,
 )
+from gyromodel.study._next import slower
 
 DEG_H = np.pi / 180 / 3600
 ROWS, STEP = 200, 10.0
@@ -112,6 +113,42 @@ def test_noise_and_instruments_have_closed_forms():
     slope = 0.1 / 3600 * t
     assert angle.instruments["temperature"] == pytest.approx(slope * np.hypot(0.5, 0.2 / np.sqrt(ROWS)))
     assert rate.instruments["temperature"] == pytest.approx(0.1 * np.hypot(0.5, 0.2))
+
+
+def test_a_long_mission_has_the_noise_and_the_errors_of_its_samples():
+    """The same ramp at a hundred times the rate, which is averaged: a rate's noise is that of one sample."""
+    rows = 100 * ROWS + 100
+    time = np.arange(rows) * STEP / 100
+    columns = {"time": time, "rate": 0 * time, "temperature": np.linspace(20.0, 60.0, rows), "output": time}
+    long = Campaign(columns, {"time": "s", "rate": "deg/s", "temperature": "degC", "output": "deg/s"}, {"kind": "rate"})
+    errors = {"temperature": Instrument(0.0, 0.5)}
+    found = sensitivity(thermal(COVARIANCE, WHITE_ALONE), long, ["angle", "rate"], instruments=errors)
+    angle, rate = (result.budget for result in found.results)
+    t = rows * STEP / 100
+    assert rate.noise["noise_white"] * DEG_H == pytest.approx(WHITE / np.sqrt(STEP / 100))
+    assert rate.instruments["temperature"] == pytest.approx(0.1 * 0.5)
+    assert np.deg2rad(angle.noise["noise_white"]) == pytest.approx(WHITE * np.sqrt(t), rel=1e-3)
+    assert angle.instruments["temperature"] == pytest.approx(0.1 / 3600 * t * 0.5 / np.sqrt(rows), rel=1e-3)
+
+
+def test_what_a_long_test_tells_counts_each_sample():
+    """Of errors that each sample has by itself, a test of twice the samples tells twice as much, averaged or not."""
+    model, errors = GyroModel(THERMAL, WHITE_ALONE), {"temperature": Instrument(0.0, 50.0)}
+
+    def told(rows: int) -> np.ndarray:
+        time = np.arange(rows) * 0.1
+        columns = {"time": time, "temperature": np.linspace(20.0, 60.0, rows), "output": time}
+        units = {"time": "s", "temperature": "degC", "output": "deg/s"}
+        return information(model, Campaign(columns, units, {"kind": "rate"}), errors)
+
+    np.testing.assert_allclose(told(30_000), 2 * told(15_000), rtol=1e-3)
+
+
+def test_a_slower_course_has_no_further_runs():
+    runs = np.repeat([1.0, 2.0], ROWS // 2)
+    course = slower(mission(temperature=RAMP).with_column("run", runs, "1"))
+    assert course.columns["run"].tolist() == np.repeat([1.0, 2.0], ROWS).tolist()
+    assert np.diff(course.columns["temperature"])[:-1] == pytest.approx(0.5 * (RAMP[1] - RAMP[0]))
 
 
 def test_draws_bear_the_first_order_out_and_shares_add_up(seed: int):
@@ -515,7 +552,6 @@ def test_a_test_plan_is_best_for_what_was_asked(files: Path, capsys: pytest.Capt
         ("model", None, ["--outcome", "speed"], "no outcome is called speed"),
         ("model", None, ["--candidates", "PLAN", "--budget", "1 h"], "list of candidates"),
         ("model", None, ["--candidates", "C", "--budget", "1 s"], "fits into"),
-        ("model", None, ["--candidates", "C", "--budget", "4"], "a time above zero"),
     ],
 )
 def test_a_study_that_cannot_be_says_why(
@@ -527,11 +563,26 @@ def test_a_study_that_cannot_be_says_why(
         str(files / {"PLAN": "plan.yaml", "C": "candidates.yaml"}.get(x, x)) if x in ("PLAN", "C") else x for x in more
     ]
     more = more if "--outcome" in more else [*more, "--outcome", "angle"]
-    assert run(files / f"{model}.yaml", "--plan", files / "bent.yaml", *more) == 1
+    assert run(files / f"{model}.yaml", "--plan", files / "bent.yaml", *more, "-o", files / "none") == 1
+    assert not (files / "none").exists()
     said = capsys.readouterr().err
     assert expected in said
     assert said.count("\n") <= 2
     assert "internal error" not in said
+
+
+def test_a_budget_without_a_unit_is_wrong_usage(files: Path, capsys: pytest.CaptureFixture[str]):
+    common = [files / "model.yaml", "--plan", files / "plan.yaml", "--candidates", files / "candidates.yaml"]
+    assert run(*common, "--budget", "4") == 2
+    assert "Invalid value for --budget: expected a time above zero" in capsys.readouterr().err
+
+
+def test_outcomes_that_no_error_reaches_have_an_empty_figure(files: Path, capsys: pytest.CaptureFixture[str]):
+    model = GyroModel(THERMAL[:1], {"noise_white": WHITE})
+    write_model(fit(simulate(model, mission(temperature=RAMP), seed=1), model), files / "bias.yaml")
+    common = [files / "bias.yaml", "--plan", files / "plan.yaml", "-o", files / "empty", "--outcome", "scale_factor"]
+    assert run(*common) == 0
+    assert "no error of the calibration" in (files / "empty" / "tornado.svg").read_text(encoding="utf-8").lower()
 
 
 def test_a_mission_that_lacks_a_column_says_which(files: Path, capsys: pytest.CaptureFixture[str]):

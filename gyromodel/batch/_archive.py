@@ -57,7 +57,7 @@ def entries(archive: str, but: Path | None = None) -> list[Entry]:
         found = _measured(_named(_campaigns_below(root), root))
     elif root.is_dir():
         groups = _groups_below(root)
-        found = _named(groups, root) if groups != [root] else [Entry(root.name, str(root.resolve()))]
+        found = _measured(_named(groups, root)) if groups != [root] else [Entry(root.name, str(root.resolve()))]
     elif root.is_file() and root.name.lower().endswith(".parquet") and (listed := _manifest(root)) is not None:
         found = [Entry(name, str((root.parent / name).resolve())) for name in listed]
     elif root.is_file():

@@ -40,7 +40,8 @@ class Results:
 
     Args:
         path: of the table.
-        made_by: what determines the results besides the data, such as hashes; a table made otherwise is refused.
+        made_by: what determines the results besides the data, such as hashes; a table made otherwise is refused. One
+            made before there were any `references` is not.
 
     Raises:
         CampaignError: the table is something else, was made otherwise, or is being written by another run.
@@ -98,7 +99,10 @@ class Results:
         """The state in which each campaign was examined, by its name; empty where that has to be done again."""
         states: dict[str, str] = {}
         for table in self._tables:
-            states |= zip(table["campaign"].to_pylist(), table["file_state"].to_pylist(), strict=True)
+            own: dict[str, str] = {}
+            for name, state in zip(table["campaign"].to_pylist(), table["file_state"].to_pylist(), strict=True):
+                own[name] = state if own.get(name, state) else ""
+            states |= own
         return states
 
     def add(self, rows: Iterable[dict[str, Any]]) -> None:
@@ -141,8 +145,10 @@ class Results:
 
     def _read(self, path: Path) -> pa.Table:
         table = read_results(path)
-        if (made_by := json.loads(table.schema.metadata[MADE_BY])) != self.made_by:
-            other = " and ".join(sorted(k for k in self.made_by if made_by.get(k) != self.made_by[k]))
+        made_by = json.loads(table.schema.metadata[MADE_BY])
+        if made_by.get("references", "{}") == "{}":
+            made_by["references"] = self.made_by.get("references")
+        if other := " and ".join(sorted(k for k in self.made_by if made_by.get(k) != self.made_by[k])):
             raise CampaignError(f"{path}: holds results of another {other}: name another file, or remove this one")
         return table
 

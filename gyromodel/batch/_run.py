@@ -92,8 +92,8 @@ def run_batch(
     before = json.loads(made_by_of(results).get("references", "{}"))
     references = {key: (value, text) for key, (value, text) in before.items()}
     references = references or open_references(every, model, diagnosing)
+    made_by["references"] = json.dumps(references)
     if references:
-        made_by["references"] = json.dumps(references)
         model = with_references(model, references)
     with Results(results, made_by) as kept:
         finished = kept.finished()
@@ -187,9 +187,8 @@ def _on_cluster(lots: Sequence[Lot], workers: int, scheduler: str | None) -> Ite
                     yield lot, [failed(lot.heads()[0], future.exception())]
                 running.update(submitted(1))
         except (CancelledError, ClosedClientError, OSError):
-            raise CampaignError(
-                f"{scheduler}: the Dask scheduler was lost; the same command goes on from here"
-            ) from None
+            lost = "the local cluster" if scheduler is None else f"{scheduler}: the Dask scheduler"
+            raise CampaignError(f"{lost} was lost; the same command goes on from here") from None
 
 
 @contextmanager

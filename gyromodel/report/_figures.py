@@ -96,6 +96,10 @@ def _figures(diagnosis: Diagnosis) -> Figures:
     )
 
 
+# Patterns of all their names.
+FIGURES = ("measured-simulated-*", "residual-*", "driver")
+
+
 def _names(drivers: list[Abscissa]) -> list[str]:
     """File names that any system takes, each once."""
     names: list[str] = []

@@ -41,7 +41,7 @@ def write_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> list[P
     Raises:
         OSError: where the folder cannot be written.
     """
-    from gyromodel.report._figures import figures
+    from gyromodel.report._figures import FIGURES, figures
 
     folder = Path(folder)
     drawn = figures(diagnosis)
@@ -52,8 +52,9 @@ def write_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> list[P
         path = folder / "figures" / f"{figure.name}.svg"
         write_text(path, figure.svg)
         written.append(path)
-    for stale in set((folder / "figures").glob("*.svg")) - set(written):
-        stale.unlink()
+    for pattern in FIGURES:
+        for stale in set((folder / "figures").glob(f"{pattern}.svg")) - set(written):
+            stale.unlink()
     write_text(folder / "report.html", page)
     return [folder / "report.html", *written]
 

@@ -212,10 +212,10 @@ def _derived(campaign: Campaign, found: dict[str, Abscissa]) -> dict[str, Abscis
             label, unit = f"rate of change of {found[name].label}", f"{found[name].unit}/min"
             made[f"{name}:rate"] = Abscissa(f"{name}:rate", label, unit, slope, True)
     for name in thermometers[1:3]:
-        difference = found[thermometers[0]].values - found[name].values
+        difference = found[thermometers[0]].values - campaign.in_unit(name, found[thermometers[0]].unit)
         label = f"{found[thermometers[0]].label} minus {found[name].label}"
         made[f"temperature:difference:{name}"] = Abscissa(
-            f"temperature:difference:{name}", label, found[name].unit, difference, True
+            f"temperature:difference:{name}", label, found[thermometers[0]].unit, difference, True
         )
     if "rate" in found and thermometers:
         heat = found[thermometers[0]]

@@ -74,7 +74,7 @@ def sobol_rows(result: Result) -> list[tuple[str, ...]]:
 
 
 def test_rows(found: Sensitivity) -> list[tuple[str, ...]]:
-    """What to do next and what it leaves of the first outcome: sentence, before, after."""
+    """What to do next and what it leaves of the first outcome: standard uncertainty, sentence."""
     budget = found.results[0].budget
     told = [t for i, t in enumerate(found.tests) if i < TOLD or t.sentence == REPEATED]
     return [(f"{t.std[budget.outcome]:.3g}", t.sentence) for t in told]
@@ -121,7 +121,10 @@ def tornado_figure(found: Sensitivity) -> str:
     with draw.style():
         figure, _ = draw.blank()
         figure.clear()
-        shown = [r.budget for r in found.results if r.budget.std > 0 or r.budget.total > 0]
+        shown = [r.budget for r in found.results if _bars(r.budget)]
+        if not shown:
+            figure.text(0.5, 0.5, "No error of the calibration reaches these outcomes.", ha="center", va="center")
+            return draw.rendered(figure, "tornado")
         counts = [len(_bars(budget)) for budget in shown]
         figure.set_size_inches(6.6, 0.3 + sum(0.28 * n + 0.85 for n in counts))
         panels = figure.subplots(len(shown), 1, squeeze=False, height_ratios=[n + 2 for n in counts])[:, 0]

@@ -209,7 +209,7 @@ def _of_errors(
         common, independent = instruments[name].sizes(np.asarray(mission.signals[name]))
         # All axes read one thermometer.
         together = np.einsum("eas,as->e", rows, change * common) ** 2
-        each = (np.einsum("eas,as->es", rows, change * independent) ** 2).sum(axis=1)
+        each = (np.einsum("eas,as->es", rows, change * independent) ** 2).sum(axis=1) / mission.together
         added[name] = float(np.sqrt((together + each).mean()))
     kinds = _each_axis(mission, record, rows)
     if kinds is None:
@@ -219,7 +219,7 @@ def _of_errors(
 
 
 def _each_axis(mission: Mission, record: Record, rows: np.ndarray | None) -> tuple[list[str], list[np.ndarray]] | None:
-    """By axis, the variance that each kind of noise causes in each entry; without rows, that of each sample."""
+    """By axis, the variance that each kind of noise causes in each entry; without rows, of each sample measured."""
     found = []
     for axis, model in enumerate(mission.models):
         if not model.noise:
@@ -239,7 +239,7 @@ def _each_axis(mission: Mission, record: Record, rows: np.ndarray | None) -> tup
             if rows is None:
                 states = markov_sum(cell, record.interval, longest).variance
                 walked = float(states[0]) * np.asarray(mission.signals["time"])[: record.rows]
-                caused.append(white * (1.0 + walked + float(states[1:].sum())))
+                caused.append(white * (mission.together + walked + float(states[1:].sum())))
             else:
                 through = _through_noise(cell, record.interval, longest, record.sampling, jnp.asarray(rows[:, axis]))
                 caused.append(white * np.asarray(through))

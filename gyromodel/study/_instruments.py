@@ -10,12 +10,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import yaml
 from jaxtyping import Array, Float
 
 from gyromodel._checks import CampaignError
 from gyromodel.campaign import Campaign
 from gyromodel.model import GyroModel
+from gyromodel.plan import read_yaml
 from gyromodel.study._mission import Mission
 from gyromodel.units import UnitError, convertible, factor, internal_unit, quantity
 
@@ -58,7 +58,7 @@ def read_instruments(path: str | Path, campaign: Campaign) -> dict[str, Instrume
     Raises:
         CampaignError: a column is not there, or an error is none.
     """
-    stated: Any = yaml.safe_load(Path(path).read_text(encoding="utf-8")).get("instruments") or {}
+    stated: Any = read_yaml(Path(path)).get("instruments") or {}
     if not isinstance(stated, Mapping):
         raise CampaignError(f"{campaign.name}: instruments maps columns to errors, such as {{temperature: 0.05 degC}}")
     found = {}

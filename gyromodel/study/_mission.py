@@ -47,6 +47,7 @@ class Mission(NamedTuple):
         output: of each model, noise-free.
         slope: of each model.
         flight: where the mission is navigated.
+        together: samples of the mission in each of these, which are their means.
     """
 
     models: tuple[GyroModel, ...]
@@ -56,6 +57,7 @@ class Mission(NamedTuple):
     output: Float[Array, "axis sample"]
     slope: Float[Array, "axis sample"]
     flight: Flight | None = None
+    together: float = 1.0
 
     def errors(self, models: tuple[GyroModel, ...]) -> Float[Array, "axis sample"]:
         """Rate errors (rad/s) where the truth is other models than the calibrated ones; zero in padding."""
@@ -207,7 +209,8 @@ def read_mission(campaign: Campaign, models: tuple[GyroModel, ...]) -> tuple[Mis
     Raises:
         ModelError: a model needs a column that the mission lacks, or that is of another unit.
     """
-    record = read_signals(average(with_known_output(campaign))[0])
+    averaged, together = average(with_known_output(campaign))
+    record = read_signals(averaged)
     models = tuple(model.prepared(record.signals) for model in models)
     for model in models:
         check_covariates(record, model)
@@ -228,6 +231,7 @@ def read_mission(campaign: Campaign, models: tuple[GyroModel, ...]) -> tuple[Mis
         output,
         slope,
         _flight(campaign, record),
+        float(together),
     )
     return mission, record
 

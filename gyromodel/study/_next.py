@@ -22,6 +22,8 @@ from gyromodel.study._known import Known
 from gyromodel.study._mission import with_known_output
 from gyromodel.units import factor, internal_unit
 
+# Columns that number stretches of a campaign.
+NUMBERED = ("segment", "run", "position")
 # The campaign that others are held against, and what an improvement leaves of an error.
 REPEATED, IMPROVED = "Repeat the run.", 0.5
 
@@ -63,7 +65,8 @@ def information(
     """
     if not model.noise:
         raise ModelError("what a test can tell depends on the noise: state noise_white and the rest in the model")
-    record = with_columns_known(read_signals(average(with_known_output(campaign))[0]))[0]
+    averaged, together = average(with_known_output(campaign))
+    record = with_columns_known(read_signals(averaged))[0]
     model = model.prepared(record.signals)
     check_covariates(record, model)
     check_units(model, record.output_unit, record.units)
@@ -77,7 +80,7 @@ def information(
             change = output_by_column(model, signals, name) / std
             all_along, own = instrument.sizes(np.asarray(signals[name]))
             common.append(change * all_along)
-            white += (change * own) ** 2
+            white += (change * own) ** 2 / together
     record = record._replace(sampling=record.sampling._replace(white=jnp.asarray(white)))
     added = [np.asarray(model.columns_of(effect, signals)) for effect in rivals]
     jacobian = np.column_stack([np.asarray(model.linearise(signals)[1]), *added]) / std
@@ -129,7 +132,8 @@ def slower(campaign: Campaign) -> Campaign:
     step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
     columns = {name: values[rows // 2] for name, values in campaign.columns.items()}
     for name in campaign.covariates:
-        columns[name] = np.interp(rows / 2.0, np.arange(len(campaign)), campaign.columns[name])
+        if name not in NUMBERED:
+            columns[name] = np.interp(rows / 2.0, np.arange(len(campaign)), campaign.columns[name])
     return Campaign(columns | {"time": time[0] + step * rows}, campaign.units, campaign.metadata, campaign.name)
 
 

@@ -12,14 +12,13 @@ from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-import yaml
 from jaxtyping import Float, Int
 
 from gyromodel._checks import CampaignError
 from gyromodel.campaign import Campaign
 from gyromodel.effects import Effect
 from gyromodel.model import GyroModel, ModelError, make_effect
-from gyromodel.plan import planned
+from gyromodel.plan import planned, read_yaml
 from gyromodel.signals import read_signals
 from gyromodel.study._known import Known
 from gyromodel.study._mission import with_known_output
@@ -94,14 +93,11 @@ def read_candidates(path: str | Path) -> list[Part]:
         CampaignError: the file is none of that; the message names the part.
     """
     path = Path(path)
-    try:
-        plan = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise CampaignError(f"{path}: is no YAML file: {' '.join(str(error).split())}") from None
-    needed = {"interval", "output", "columns", "candidates"}
+    plan = read_yaml(path)
+    needed = {"interval", "kind", "output", "columns", "candidates"}
     missing = sorted(needed - set(plan)) if isinstance(plan, dict) else sorted(needed)
     if missing or not isinstance(plan["columns"], dict) or not isinstance(plan["candidates"], list):
-        raise CampaignError(f"{path}: needs interval, output, columns and a list of candidates")
+        raise CampaignError(f"{path}: needs interval, kind, output, columns and a list of candidates")
     usual, parts = plan.pop("columns"), []
     try:
         changeover = seconds(plan.pop("changeover")) if "changeover" in plan else 0.0
