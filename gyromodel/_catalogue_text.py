@@ -13,9 +13,11 @@ from gyromodel.declarations import NOISE, declarations
 
 
 def entries(name: str | None) -> list[dict[str, Any]]:
-    """The whole catalogue as plain data, or the one entry of a name."""
+    """The whole catalogue as plain data, or the one entry of a name; bias_<column> is that of any column."""
     every = declarations() | NOISE
     if name is not None and name not in every:
+        if name.startswith("bias_"):
+            return [asdict(every["bias_column"])]
         close = get_close_matches(name, every, n=3)
         hint = f"; did you mean {' or '.join(close)}?" if close else "; `gyromodel effects` lists them"
         raise typer.BadParameter(f"no effect is called {name}{hint}", param_hint="ID")

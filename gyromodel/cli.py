@@ -136,7 +136,10 @@ def diagnose(
     output: Folder,
     axis: Axis = None,
     calibrate: Annotated[
-        int, typer.Option(min=0, metavar="N", help="Take the threshold from N simulated campaigns with nothing hidden.")
+        int,
+        typer.Option(
+            min=0, metavar="N", help="Take the threshold from N simulated campaigns with nothing hidden (200 or more)."
+        ),
     ] = 0,
     seed: Seed = 0,
     as_json: AsJson = False,

@@ -72,6 +72,10 @@ NOISE = {
         NoiseKind("noise_quantisation", "arcsec", "(2πf)² Q² τ0", "3 Q²/τ²", "white noise of the angle; not stated"),
         NoiseKind("noise_telegraph", "deg/h", "–", "–", "hops of the bias between two levels; not stated"),
         NoiseKind("noise_heteroscedastic", "1", "–", "–", "a level that follows rate, temperature or time; not stated"),
+        NoiseKind(
+            "noise_rate_ramp", "deg/h/h", "–", "R² τ²/2", "a trend of a gyro at rest, as `allan` tells it; not stated"
+        ),
+        NoiseKind("outliers", "–", "–", "–", "gross errors in single samples, test points or dwells; not stated"),
     )
 }
 

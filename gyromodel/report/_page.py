@@ -336,7 +336,8 @@ def _threshold(diagnosis: Diagnosis) -> str:
         )
     return (
         f"An effect is accepted when its evidence exceeds {bound}, odds of {_odds(diagnosis.threshold)} after paying "
-        "for the number of forms tried. This is the safe default; it was not calibrated by simulating this campaign."
+        "for the number of forms tried. This is the safe default, with what few samples, or a random walk that would "
+        "imitate this effect, add to it; it was not calibrated by simulating this campaign."
     )
 
 
