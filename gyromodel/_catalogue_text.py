@@ -11,15 +11,19 @@ import typer
 from gyromodel._console import print_table
 from gyromodel.declarations import NOISE, declarations
 
+# Likeness of a name to an effect's that is taken for a slip of the pen.
+SLIP = 0.85
+
 
 def entries(name: str | None) -> list[dict[str, Any]]:
     """The whole catalogue as plain data, or the one entry of a name; bias_<column> is that of any column."""
     every = declarations() | NOISE
     if name is not None and name not in every:
-        if name.startswith("bias_"):
+        if name.startswith("bias_") and not get_close_matches(name, every, cutoff=SLIP):
             return [asdict(every["bias_column"])]
         close = get_close_matches(name, every, n=3)
         hint = f"; did you mean {' or '.join(close)}?" if close else "; `gyromodel effects` lists them"
+        hint += " (what follows a column is in bias_column)" if name.startswith("bias_") else ""
         raise typer.BadParameter(f"no effect is called {name}{hint}", param_hint="ID")
     return [asdict(every[name])] if name else [asdict(entry) for entry in every.values()]
 
