@@ -201,6 +201,11 @@ def test_a_misspelt_effect_is_met_with_the_nearest(run: Run):
     assert "bias_temperature" in run("effects", "bias_temprature").err
 
 
+@pytest.mark.parametrize(("name", "entry"), [("bias_pressure", "bias_column"), ("outliers", "outliers")])
+def test_every_name_that_results_have_is_explained(run: Run, name: str, entry: str):
+    assert json.loads(run("effects", name, "--json").out)["id"] == entry
+
+
 def test_effects_lists_the_catalogue(run: Run):
     shown = run("effects")
     assert shown.status == 0
