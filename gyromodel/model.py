@@ -309,7 +309,15 @@ def make_effect(label: str) -> Effect:
 
 
 def model_from_effects(labels: Iterable[str], gyro: str = "") -> GyroModel:
-    """A model of the named effects with every parameter free and the noise to be estimated."""
+    """A model of the named effects with every parameter free and the noise to be estimated.
+
+    Args:
+        labels: names of the catalogue; bias_<column> of any other column.
+        gyro: what kind of gyro it is, as a word.
+
+    Raises:
+        ModelError: an effect is not known, or named twice.
+    """
     return GyroModel(tuple(make_effect(label) for label in labels), gyro=gyro)
 
 
@@ -367,10 +375,16 @@ def check_units(model: GyroModel, output_unit: str, units: Mapping[str, str]) ->
 
 
 def simulate(model: GyroModel, campaign: Campaign, seed: int = 0) -> Campaign:
-    """The campaign with its output replaced by the model's, noise drawn from the model's noise coefficients.
+    """The campaign with its output replaced by the model's, with a draw of the noise that the model states, if any.
+
+    Args:
+        model: with the values of all effects.
+        campaign: time, columns and the output's unit and kind; without an output, a rate in deg/s.
+        seed: of the noise.
 
     Raises:
-        ModelError: the model misses a value, a column or its noise.
+        CampaignError: it is no campaign of one gyro.
+        ModelError: the model misses a value or a column, or what it states of the noise is none.
     """
     if not campaign.outputs:
         campaign = campaign.with_column("output", np.arange(len(campaign), dtype=float), "deg/s")

@@ -36,7 +36,7 @@ from gyromodel.diagnosis._evidence import (
 from gyromodel.diagnosis._forms import step_at
 from gyromodel.diagnosis._pairs import best_pair
 from gyromodel.diagnosis._ranking import rank
-from gyromodel.diagnosis._said import _places
+from gyromodel.diagnosis._said import places
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._verdict import _as_set
 from gyromodel.effects.drivers import BiasStep
@@ -666,7 +666,7 @@ def test_a_faint_line_beside_codes_may_be_theirs() -> None:
 @pytest.mark.long
 def test_many_gross_errors_are_given_up_together(rng: np.random.Generator) -> None:
     """More of them than the search has rounds, beside a bias over temperature."""
-    wild = np.sort(rng.choice(ROWS // 5, 20, replace=False)) * 5
+    wild = np.sort(rng.choice(ROWS // 5, 20, replace=False)) * 5  # none follows another
     wrong = np.zeros(ROWS)
     wrong[wild] = rng.choice([-1.0, 1.0], 20) * rng.uniform(15.0, 60.0, 20)
     log = static_log(rng, wrong)
@@ -685,7 +685,16 @@ def test_a_gross_error_is_told_where_it_is_in_its_file(rng: np.random.Generator)
     assert "A gross error in data row 101 of second: given up, not modelled." in found.findings
     halved, together = average(second, ROWS // 2)
     assert together == 2
-    assert _places([50, 52], [(halved, False)]) == "at 2010 s, 2090 s"
+    assert places([50, 52], [(halved, False)]) == "at 2010 s, 2090 s"
+    assert places([3, 4, ROWS - 1, ROWS], [(first, True), (second, True)]) == (
+        f"in data rows 4 to 5 of {first.name}, {ROWS} of {first.name}, 1 of second"
+    )
+
+
+def test_no_campaign_is_said() -> None:
+    for answer in (gm.fit, gm.diagnose):
+        with pytest.raises(gm.CampaignError, match="there is no campaign"):
+            answer([], gm.model_from_effects(["bias"]))
 
 
 def test_a_bias_is_no_step_at_the_end_of_the_record() -> None:

@@ -312,6 +312,14 @@ def test_steps_of_the_output_are_said_of(quantum: float, said: bool, rng: np.ran
     assert sentence is None or f"steps of {quantum:.5g} deg/s" in sentence
 
 
+def test_a_sweep_of_rates_is_no_steps_of_the_output(rng: np.random.Generator):
+    rate = 10.0 * np.arange(12)
+    output = 77_283.0 * rate + 2500.0 * rng.standard_normal(12)
+    columns = {"time": np.arange(12.0), "rate": rate, "output": output.round()}
+    units = {"time": "s", "rate": "deg/s", "output": "count"}
+    assert steps_of_output(gm.Campaign(columns, units, {"kind": "rate"})) is None
+
+
 @pytest.mark.parametrize(
     ("quantum", "repeats", "said"), [(0.0, 4, False), (0.0, 7, True), (0.05, 6, False), (0.05, 40, True)]
 )

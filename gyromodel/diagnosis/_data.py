@@ -50,6 +50,8 @@ class Data:
 
 def read(measured: Sequence[Campaign], without: str = "") -> Data:
     """Campaigns of one gyro, or logs of one platform without runs about some axis, as they are searched."""
+    if not measured:
+        raise CampaignError("there is no campaign to look at")
     of_platform = [is_platform(c) for c in measured]
     if all(of_platform):
         test = vibration_record(measured, without)

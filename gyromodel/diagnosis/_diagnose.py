@@ -64,6 +64,7 @@ def diagnose(
 
     Raises:
         CampaignError, ModelError, EstimateError: the data or the model cannot answer; the message says why.
+        ValueError: too few draws are asked for.
     """
     if 0 < calibrate < FEWEST_DRAWS:
         raise ValueError(f"{calibrate} draws cannot show a 99 % point: calibrate with {FEWEST_DRAWS} or more, or 0")

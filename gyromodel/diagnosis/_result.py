@@ -43,7 +43,10 @@ class Confuser:
 
 @dataclass(frozen=True)
 class Cause:
-    """A discrepancy's cause: its evidence (ln of the evidence ratio), parameters, and what it could be mistaken for."""
+    """A discrepancy's cause: its evidence (ln of the evidence ratio), parameters, and what it could be mistaken for.
+
+    Points that are given up are rows of what was searched, from 0, and `places` says where they are in the files.
+    """
 
     effect: str
     parameters: tuple[ParameterValue, ...]
@@ -53,6 +56,7 @@ class Cause:
     posterior: float
     confusers: tuple[Confuser, ...] = ()
     points: tuple[int, ...] = ()
+    places: str = ""
 
 
 @dataclass(frozen=True)

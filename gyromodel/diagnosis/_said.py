@@ -98,12 +98,12 @@ def _given_up(steps: Steps, selection: Selection, searched: Sequence[tuple[Campa
     dwells = steps.scanner.points_among(given_up)
     if dwells:
         what = f"{len(dwells)} whole dwells, which begin" if len(dwells) > 1 else "A whole dwell, which begins"
-        yield f"{what} {_places([int(d[0]) for d in dwells], searched)}: given up, not modelled."
+        yield f"{what} {places([int(d[0]) for d in dwells], searched)}: given up, not modelled."
     of_dwells = {int(row) for dwell in dwells for row in dwell}
     errors = [row for row in given_up if row not in of_dwells]
     if errors:
         what = f"{len(errors)} gross errors" if len(errors) > 1 else "A gross error"
-        yield f"{what} {_places(errors, searched)}: given up, not modelled."
+        yield f"{what} {places(errors, searched)}: given up, not modelled."
 
 
 def _in_campaign(effect: Effect | None) -> str:
@@ -140,17 +140,24 @@ def _moved(estimate: Estimate, other: Estimate | None) -> str:
     return f"; with it {listed(said)}" if said else ""
 
 
-def _places(rows: Sequence[int], searched: Sequence[tuple[Campaign, bool]]) -> str:
+def places(rows: Sequence[int], searched: Sequence[tuple[Campaign, bool]]) -> str:
     """Where rows of the record are in the files: by row, or by time where rows were left out or averaged."""
     begins = np.cumsum([0, *(len(c) for c, _ in searched)])
+    stretches: list[list[int]] = []
+    for row in rows:
+        if stretches and row == stretches[-1][1] + 1 and row not in begins:
+            stretches[-1][1] = row
+        else:
+            stretches.append([row, row])
     by_row, some = all(as_given for _, as_given in searched), []
-    for row in rows[:ROWS_TOLD]:
-        i = int(np.searchsorted(begins, row, side="right")) - 1
-        campaign, own = searched[i][0], row - begins[i]
-        place = f"{own + 1}" if by_row else f"{campaign.columns['time'][own]:.10g} {campaign.units['time']}"
-        some.append(place + (f" of {campaign.name}" if len(searched) > 1 else ""))
+    for ends in stretches[:ROWS_TOLD]:
+        i = int(np.searchsorted(begins, ends[0], side="right")) - 1
+        campaign, own = searched[i][0], [end - int(begins[i]) for end in ends]
+        told = [f"{end + 1}" if by_row else f"{campaign.columns['time'][end]:.10g}" for end in own]
+        unit = "" if by_row else f" {campaign.units['time']}"
+        some.append(" to ".join(dict.fromkeys(told)) + unit + (f" of {campaign.name}" if len(searched) > 1 else ""))
     how = "at" if not by_row else "in data rows" if len(rows) > 1 else "in data row"
-    return f"{how} {', '.join(some)}{'…' if len(rows) > ROWS_TOLD else ''}"
+    return f"{how} {', '.join(some)}{'…' if len(stretches) > ROWS_TOLD else ''}"
 
 
 def _close_rival(step: Found, told: set[str]) -> str | None:

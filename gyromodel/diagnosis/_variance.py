@@ -142,10 +142,13 @@ def tails(estimate: Estimate) -> str | None:
 
 
 def steps_of_output(campaign: Campaign) -> str | None:
-    """A sentence where the output comes in steps: in few levels, or in steps as large as its scatter."""
+    """A sentence where the output comes in steps: in few levels, or in steps as large as its scatter.
+
+    Values that never come back are none, such as those of a sweep of rates that are evenly apart.
+    """
     name = campaign.outputs[0]
     values = campaign.columns[name][np.isfinite(campaign.columns[name])]
-    step = quantum(values)
+    step = quantum(values) if len(np.unique(values)) < len(values) else None
     scatter = float(np.diff(values).std() / np.sqrt(2.0))
     if step is None or not scatter or (step < COARSE * scatter and len(values) < OFTEN * len(np.unique(values))):
         return None

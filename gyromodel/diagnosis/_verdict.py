@@ -17,7 +17,7 @@ from gyromodel.diagnosis._exchange import uncontested
 from gyromodel.diagnosis._points import levels
 from gyromodel.diagnosis._ranking import SLOW_IN_TIME, TIME_MARGIN, Ranking, is_driver, is_noise, special_cases
 from gyromodel.diagnosis._result import CREDIBLE, VAGUE, Cause, ParameterValue, Verdict
-from gyromodel.diagnosis._said import told, told_of_cause, told_of_rest
+from gyromodel.diagnosis._said import places, told, told_of_cause, told_of_rest
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import Selection
 from gyromodel.diagnosis._shapes import remaining
@@ -120,7 +120,8 @@ def judge(
         findings += told_of_cause(steps, step, extended, {*members, *beside})
         turn = sum(f.name == step.name for f in selection.found[i:])
         least, statistic = steps.least(ranking, step.name), ranking.statistic[step.name]
-        causes.append(cause_of(scanner, extended, step, turn, ranking, members, statistic, trials, null_scores, least))
+        cause = cause_of(scanner, extended, step, turn, ranking, members, statistic, trials, null_scores, least)
+        causes.append(replace(cause, places=places(sorted(step.points), searched)) if step.points else cause)
         sets.append(members)
     sets = _with_doubts(causes, sets, extended)
     order = sorted(range(len(causes)), key=lambda i: -causes[i].statistic)

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gyromodel._checks import CampaignError
 from gyromodel.attitude import refuse_navigated, with_reference_rates
 from gyromodel.averages import MEAN_OF_ATTITUDE, average
 from gyromodel.campaign import Campaign
@@ -54,6 +55,7 @@ def fit(
         name: what these data are called where their part in a later result's uncertainty is told.
 
     Raises:
+        CampaignError: there is no campaign, one has several axes, or two are the same.
         EstimateError: the campaign does not determine some combination of parameters, or the fit did not converge.
         ModelError: the model needs columns the campaign lacks.
     """
@@ -71,8 +73,10 @@ def read_for_fit(campaigns: Sequence[Campaign]) -> Record:
     """The signals that `fit` fits to.
 
     Raises:
-        CampaignError: the campaigns do not match, or one has no output of a gyro, or has been navigated.
+        CampaignError: there is none, they do not match, or one has no output of a gyro, or has been navigated.
     """
+    if not campaigns:
+        raise CampaignError("there is no campaign to fit to")
     refuse_navigated(campaigns)
     rated = [with_reference_rates(c)[0] for c in campaigns]
     means = [MEAN_OF_ATTITUDE * (r is not c) for r, c in zip(rated, campaigns, strict=True)]

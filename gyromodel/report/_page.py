@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -161,7 +161,7 @@ def _cause(cause: Cause) -> dict[str, Any]:
             {"title": title(c.effect), "id": c.effect, "separation": c.separation, "word": _separation(c.separation)}
             for c in sorted(cause.confusers, key=lambda c: c.separation)
         ],
-        "points": _rows(cause.points),
+        "places": cause.places,
     }
 
 
@@ -371,15 +371,3 @@ def _separation(value: float) -> str:
     """A separation in words."""
     bounds = ((0.05, "cannot be told apart"), (0.3, "hardly told apart"), (0.7, "partly alike"))
     return next((word for bound, word in bounds if value < bound), "clearly different")
-
-
-def _rows(points: Iterable[int]) -> str:
-    """Data row numbers, the first below the header being 1, with runs joined, e.g. "4 to 9 and 21"."""
-    runs: list[list[int]] = []
-    for row in sorted(point + 1 for point in points):
-        if runs and row == runs[-1][1] + 1:
-            runs[-1][1] = row
-        else:
-            runs.append([row, row])
-    texts = [str(a) if a == b else f"{a} to {b}" for a, b in runs]
-    return listed(texts[:20]) + (f" and {len(texts) - 20} more" if len(texts) > 20 else "")
