@@ -131,15 +131,19 @@ def test_blocks_alike_by_chance_do_not_make_a_gain_known_better_than_noise_leave
     assert np.array(gain.log_score_ci95) == pytest.approx(0.5 * signal**2 + 1.96 * signal * np.array([-1, 1]), rel=1e-3)
 
 
-@pytest.mark.parametrize("effect", ["bias_pressure", "bias_turn_on"])
+@pytest.mark.parametrize("effect", ["bias", "bias_pressure", "bias_turn_on"])
 def test_the_true_gain_of_the_study_is_that_of_least_squares_on_average(effect: str, rng: np.random.Generator):
     """Fits drawn many times, their columns written out; no run's own offset is known of a run left out."""
     case = Case(7, "repeated_runs" if effect == "bias_turn_on" else "static_cycle", "white", effect, 3.0)
     built = build(case)
     wrong, spread, true = built.truth.error, built.truth.noise.std(), built.design.true
     run = true.get("run", np.zeros(len(wrong)))
-    own = run[:, None] == np.unique(run)[1:] if effect == "bias_turn_on" else true["pressure"][:, None]
-    simulated = np.ones((len(wrong), 1))
+    constant, none = np.ones((len(wrong), 1)), np.zeros((len(wrong), 0))
+    simulated, own = {
+        "bias": (none, constant),
+        "bias_pressure": (constant, true.get("pressure", run)[:, None]),
+        "bias_turn_on": (constant, run[:, None] == np.unique(run)[1:]),
+    }[effect]
     folds = folds_of(read_signals(gm.Campaign(columns=built.columns, units=built.units, metadata=built.metadata)))[0]
     squares = np.zeros(2)
     for _ in range(60):

@@ -26,7 +26,7 @@ def true_gain(case: Case) -> float:
     built = build(case)
     design, truth = built.design, built.truth
     signal = truth.error / np.linalg.norm(truth.error)
-    before = np.column_stack([error(name, design, 1.0, {}) for name in truth.baseline])
+    before = np.column_stack([np.zeros((len(signal), 0)), *(error(n, design, 1.0, {}) for n in truth.baseline)])
     forms = np.moveaxis(library(design, case.effect)[str(case.effect)], 1, 0)
     models = [np.column_stack([before, form]) for form in forms]
     left = [np.linalg.norm(signal - _fit(model, signal, model)) for model in models]
