@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import binom, norm
 
 from gyromodel.campaign import Campaign
-from gyromodel.estimate import fit_record, with_noise_intervals
+from gyromodel.estimate import _noise, fit_record, with_noise_intervals
 from gyromodel.model import model_from_effects
 from gyromodel.noise import (
     NoiseRatios,
@@ -248,6 +248,23 @@ def test_intervals_of_markov_noise_hold_what_was_fitted_and_what_is_true(N: floa
             inside[name] += low * (true > 0) <= true <= high
     for name, hits in inside.items():
         assert binom.cdf(hits, 8, 0.93) > 1e-4, (name, hits)
+
+
+@pytest.mark.parametrize("walk", [0.0, 0.002, 0.05])
+def test_intervals_are_those_of_many_levels(walk: float, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch):
+    """White noise with none, little and much of a walk beside it: the best ratio is often a small part of its bound."""
+    record, model = with_rows(1024), model_from_effects(["bias"])
+    for _ in range(5):
+        output = rng.standard_normal(1024) + walk * np.cumsum(rng.standard_normal(1024))
+        estimate = fit_record(with_output(record, output), model, markov=False)
+        few = with_noise_intervals(estimate).noise_interval
+        with monkeypatch.context() as patched:
+            patched.setattr(_noise, "INTERVAL_LEVELS", 36)
+            patched.setattr(_noise, "FINER_LEVELS", 181)
+            many = with_noise_intervals(estimate).noise_interval
+        for name, (low, high) in few.items():
+            assert high == pytest.approx(many[name][1], rel=0.1), name
+            assert low == pytest.approx(many[name][0], abs=0.1 * high), name
 
 
 def test_white_noise_shows_no_other(rng: np.random.Generator):

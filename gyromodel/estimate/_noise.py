@@ -21,6 +21,8 @@ COARSE_STEPS, FINE_STEPS = (0.8, 0.4, 0.2, 0.1), (0.7, 0.35, 0.17)
 MARKOV_LEAD = 5.0
 # Levels of each noise ratio over its likely range, for the intervals of the noise coefficients, and between them.
 INTERVAL_LEVELS, FINER_LEVELS = 10, 41
+# A unit of so many times the largest amplitude makes a scale even in amplitude.
+LINEAR = 1e3
 # Half the 95 % point of chi-squared with one degree of freedom.
 REJECTED = 1.92
 # So many times it: no part of any interval.
@@ -117,14 +119,15 @@ def with_noise_intervals(estimate: Estimate) -> Estimate:
     for turn, margin in enumerate((4.0, 2.0, 2.0, 2.0, 0.0)):
         result = restricted_likelihood(_mesh(levels), record.interval, span, record.sampling, jacobian, residual)
         below = result.log_likelihood.max() - result.log_likelihood
-        # Only levels even in prominence are for splines.
+        # Only levels even on some scale are for splines.
         if not margin or (turn and np.sum(below < REJECTED) > 2 * INTERVAL_LEVELS):
             break
-        likely = below < margin * REJECTED
-        levels = [_levels(np.asarray(r), likely, float(b)) for r, b in zip(_mesh(levels), estimate.ratios, strict=True)]
+        likely, mesh = below < margin * REJECTED, [np.asarray(r) for r in _mesh(levels)]
+        units = [_unit(r, likely, float(b)) for r, b in zip(mesh, estimate.ratios, strict=True)]
+        levels = [_levels(r, likely, unit) for r, unit in zip(mesh, units, strict=True)]
     # A likelihood that falls off steeply would make splines swing where it does not.
     hoped = np.maximum(result.log_likelihood, result.log_likelihood.max() - HOPELESS * REJECTED)
-    finer, (log_likelihood, log_sum) = _finer(levels, estimate.ratios, hoped, np.log(result.residual_sum))
+    finer, (log_likelihood, log_sum) = _finer(levels, units, hoped, np.log(result.residual_sum))
     kept = log_likelihood.max() - log_likelihood < REJECTED
     white = np.exp(log_sum[kept]) / result.degrees_of_freedom
     ratios = _mesh(finer).take(kept)
@@ -135,35 +138,41 @@ def with_noise_intervals(estimate: Estimate) -> Estimate:
     return replace(estimate, noise_interval=spans)
 
 
-def _prominence(ratio: np.ndarray, best: float) -> np.ndarray:
-    """Amplitude of one noise against the best one's, from zero to a half there and one where there is nothing else."""
-    amplitude = np.sqrt(ratio)
-    return amplitude / (amplitude + np.sqrt(best)) if best > 0 else amplitude
+def _unit(ratio: np.ndarray, likely: np.ndarray, best: float) -> float:
+    """Amplitude up to which levels are even, beyond which they grow evenly: the best one's where none is not likely.
+
+    A likelihood that has its say near the best may be flat far beyond, where there is next to no white noise.
+    """
+    none = ratio[likely].min() == ratio.min()
+    return LINEAR * float(np.sqrt(ratio.max() or 1.0)) if none else float(np.sqrt(best))
 
 
-def _ratio(prominence: np.ndarray, best: float) -> np.ndarray:
-    return (prominence / (1 - prominence)) ** 2 * best if best > 0 else prominence**2
+def _on_scale(ratio: np.ndarray, unit: float) -> np.ndarray:
+    return np.arcsinh(np.sqrt(ratio) / unit)
 
 
-def _levels(ratio: np.ndarray, likely: np.ndarray, best: float) -> np.ndarray:
-    """Levels of one noise ratio, even in prominence, from the one below its likely range to the one above."""
+def _ratio(place: np.ndarray, unit: float) -> np.ndarray:
+    return (unit * np.sinh(place)) ** 2
+
+
+def _levels(ratio: np.ndarray, likely: np.ndarray, unit: float) -> np.ndarray:
+    """Levels of one noise ratio, even on the scale of a unit, from the one below its likely range to the one above."""
     levels = np.unique(ratio)
     first, last = np.searchsorted(levels, [ratio[likely].min(), ratio[likely].max()])
-    ends = levels[[max(first - 1, 0), min(last + 1, len(levels) - 1)]]
-    low, high = _prominence(ends, best)
-    return np.unique(_ratio(np.linspace(low, high, INTERVAL_LEVELS), best))
+    low, high = _on_scale(levels[[max(first - 1, 0), min(last + 1, len(levels) - 1)]], unit)
+    return np.unique(_ratio(np.linspace(low, high, INTERVAL_LEVELS), unit))
 
 
 def _finer(
-    levels: Sequence[np.ndarray], best: NoiseRatios, *values: np.ndarray
+    levels: Sequence[np.ndarray], units: Sequence[float], *values: np.ndarray
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Levels closer together in prominence, where there are several, and what cubic splines make of values there."""
-    prominences = [_prominence(r, float(b)) for r, b in zip(levels, best, strict=True)]
-    closer = [np.linspace(p[0], p[-1], FINER_LEVELS if len(p) > 1 else 1) for p in prominences]
+    """Levels closer together on their scales, where there are several, and what cubic splines make of values there."""
+    places = [_on_scale(r, unit) for r, unit in zip(levels, units, strict=True)]
+    closer = [np.linspace(p[0], p[-1], FINER_LEVELS if len(p) > 1 else 1) for p in places]
     made = []
     for value in values:
-        grid = value.reshape([len(p) for p in prominences])
-        for axis, (p, at) in enumerate(zip(prominences, closer, strict=True)):
+        grid = value.reshape([len(p) for p in places])
+        for axis, (p, at) in enumerate(zip(places, closer, strict=True)):
             grid = make_interp_spline(p, grid, k=min(3, len(p) - 1), axis=axis)(at)
         made.append(grid.ravel())
-    return [_ratio(p, float(b)) for p, b in zip(closer, best, strict=True)], made
+    return [_ratio(p, unit) for p, unit in zip(closer, units, strict=True)], made
