@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import asdict
 from difflib import get_close_matches
 from typing import Any
@@ -11,21 +12,21 @@ import typer
 from gyromodel._console import print_table
 from gyromodel.declarations import NOISE, declarations
 
-# Likeness of a name to an effect's that is taken for a slip of the pen.
-SLIP = 0.85
-
 
 def entries(name: str | None) -> list[dict[str, Any]]:
     """The whole catalogue as plain data, or the one entry of a name; bias_<column> is that of any column."""
     every = declarations() | NOISE
-    if name is not None and name not in every:
-        if name.startswith("bias_") and not get_close_matches(name, every, cutoff=SLIP):
-            return [asdict(every["bias_column"])]
-        close = get_close_matches(name, every, n=3)
-        hint = f"; did you mean {' or '.join(close)}?" if close else "; `gyromodel effects` lists them"
-        hint += " (what follows a column is in bias_column)" if name.startswith("bias_") else ""
-        raise typer.BadParameter(f"no effect is called {name}{hint}", param_hint="ID")
-    return [asdict(every[name])] if name else [asdict(entry) for entry in every.values()]
+    if name is None:
+        return [asdict(entry) for entry in every.values()]
+    if name not in every:
+        close = " or ".join(get_close_matches(name, every, n=3))
+        if not name.startswith("bias_"):
+            hint = f"; did you mean {close}?" if close else "; `gyromodel effects` lists them"
+            raise typer.BadParameter(f"no effect is called {name}{hint}", param_hint="ID")
+        hint = f"; or did you mean {close}?" if close else ""
+        print(f"gyromodel: {name} is the bias of a column {name.removeprefix('bias_')}{hint}", file=sys.stderr)
+        name = "bias_column"
+    return [asdict(every[name])]
 
 
 def print_catalogue(found: list[dict[str, Any]]) -> None:

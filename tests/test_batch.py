@@ -511,7 +511,10 @@ def test_an_archive_without_a_readable_campaign_goes_on_when_there_is_one(tmp_pa
     write_campaign(campaign(0), place / "c0.csv")
     done = here(tmp_path)
     assert (done.failed, set(done.references)) == (0, {"bias_temperature.reference"})
-    assert here(tmp_path).examined == 0
+    warmer = np.array(campaign(1).columns["temperature"]) + 40.0
+    write_campaign(campaign(1).with_column("temperature", warmer, "degC"), place / "a0.csv")
+    more = here(tmp_path)
+    assert (more.examined, more.references) == (1, done.references)
 
 
 def test_a_run_that_ends_meanwhile_is_no_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -186,7 +186,7 @@ def test_the_module_runs_as_a_program():
         ["export", "m.yaml", "--to", "fortran"],
         ["allan", "campaign.csv"],
         ["allan", "campaign.csv", "-o", "out", "--axis", "w"],
-        ["effects", "bias_temprature"],
+        ["effects", "scale_temprature"],
         ["effects", "--unknown"],
     ],
 )
@@ -198,10 +198,19 @@ def test_wrong_usage_ends_with_status_2(run: Run, arguments: list[str]):
 
 
 def test_a_misspelt_effect_is_met_with_the_nearest(run: Run):
-    assert "bias_temperature" in run("effects", "bias_temprature").err
+    for name in ("bias_temperature", "scale_temperature"):
+        assert name in run("effects", name.replace("era", "ra")).err
 
 
-@pytest.mark.parametrize(("name", "entry"), [("bias_pressure", "bias_column"), ("outliers", "outliers")])
+@pytest.mark.parametrize(
+    ("name", "entry"),
+    [
+        ("bias_pressure", "bias_column"),
+        ("bias_acceleration_x", "bias_column"),
+        ("bias_column_temperature_rate", "bias_column"),
+        ("outliers", "outliers"),
+    ],
+)
 def test_every_name_that_results_have_is_explained(run: Run, name: str, entry: str):
     assert json.loads(run("effects", name, "--json").out)["id"] == entry
 

@@ -135,13 +135,16 @@ class Results:
         # The sort keeps equal ones as they are: parameters stay in the order of the model.
         whole = pa.concat_tables(kept)
         order_of = sorted(range(len(whole)), key=whole["_place"].to_pylist().__getitem__)
-        whole = whole.take(order_of).drop_columns(["_place"])
+        whole = whole.take(order_of).drop_columns(["_place"]).replace_schema_metadata(self._metadata())
         write_table(whole, self.path)
         shutil.rmtree(self._folder)
         return whole
 
     def _table(self, rows: list[dict[str, Any]]) -> pa.Table:
-        return pa.Table.from_pylist(rows, SCHEMA).replace_schema_metadata({MADE_BY: json.dumps(self.made_by)})
+        return pa.Table.from_pylist(rows, SCHEMA).replace_schema_metadata(self._metadata())
+
+    def _metadata(self) -> dict[bytes, str]:
+        return {MADE_BY: json.dumps(self.made_by)}
 
     def _read(self, path: Path) -> pa.Table:
         table = read_results(path)
@@ -163,11 +166,13 @@ def _parts_of(path: Path) -> Path:
     return path.with_name(f".{path.name}.parts")
 
 
-def made_by_of(path: Path) -> dict[str, str]:
-    """What made a table, or the parts of one that is not finished; empty where there is none."""
+def references_of(path: Path) -> dict[str, Any]:
+    """The references of a table, or of the parts of one that is not finished; empty where none has any yet."""
     for file in (path, *sorted(_parts_of(path).glob("*.parquet"))):
         with suppress(pa.ArrowException, OSError):
-            return json.loads((parquet.read_schema(file).metadata or {}).get(MADE_BY, b"{}"))
+            made_by = json.loads((parquet.read_schema(file).metadata or {}).get(MADE_BY, b"{}"))
+            if found := json.loads(made_by.get("references", "{}")):
+                return found
     return {}
 
 

@@ -21,7 +21,7 @@ import gyromodel
 from gyromodel._checks import CampaignError
 from gyromodel.batch._archive import Entry, entries
 from gyromodel.batch._references import References, open_references, with_references
-from gyromodel.batch._results import Results, made_by_of
+from gyromodel.batch._results import Results, references_of
 from gyromodel.batch._work import Lot, Row, examine, failed, read
 from gyromodel.model import GyroModel
 
@@ -89,8 +89,7 @@ def run_batch(
         "task": task,
     }
     # As before: the first campaign may be another one now.
-    before = json.loads(made_by_of(results).get("references", "{}"))
-    references = {key: (value, text) for key, (value, text) in before.items()}
+    references = {key: (value, text) for key, (value, text) in references_of(results).items()}
     references = references or open_references(every, model, diagnosing)
     made_by["references"] = json.dumps(references)
     if references:
