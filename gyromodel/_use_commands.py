@@ -1,4 +1,4 @@
-"""Commands that put calibrations to use: budgets of missions, compensation, navigation, archives, export."""
+"""Commands beyond one gyro's model: missions and test plans, compensation, navigation, archives, export."""
 
 from __future__ import annotations
 

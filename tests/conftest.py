@@ -5,6 +5,7 @@ This file must not import gyromodel: the run-time shape checks are installed aft
 
 from __future__ import annotations
 
+import inspect
 import os
 import secrets
 import signal
@@ -58,10 +59,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the longest, those of test_discovery.py, shared between two workers: each is dealt half, in order.
 
     A verdict of random draws that is not as a test has it is drawn anew, once: what chance fails once in fifty runs it
-    hardly fails twice. What is wrong in some draws only shows less often; the summary tells which were.
+    hardly fails twice. What is wrong in some draws only shows less often; the summary tells which were. Tests that
+    count draws have limits of their own.
     """
     for item in items:
-        if "seed" in getattr(item, "fixturenames", ()) and Path(item.path).stem in VERDICTS:
+        drawn = isinstance(item, pytest.Function) and "seed" in item.fixturenames
+        if drawn and Path(item.path).stem in VERDICTS and "binom" not in inspect.getsource(item.function):
             item.add_marker(pytest.mark.flaky(reruns=1))
     first = [item for item in items if "test_discovery" in item.nodeid and item.get_closest_marker("long")]
     rest = [item for item in items if item not in first]

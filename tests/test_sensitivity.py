@@ -27,6 +27,7 @@ from gyromodel.model import GyroModel, ModelError, simulate
 from gyromodel.model_files import write_model
 from gyromodel.numerics.uncertain import Uncertain
 from gyromodel.report import plan_sentence
+from gyromodel.signals import read_signals
 from gyromodel.study import (
     OUTCOMES,
     Instrument,
@@ -145,10 +146,16 @@ def test_what_a_long_test_tells_counts_each_sample():
 
 
 def test_a_slower_course_has_no_further_runs():
-    runs = np.repeat([1.0, 2.0], ROWS // 2)
-    course = slower(mission(temperature=RAMP).with_column("run", runs, "1"))
+    """And a run behind a gap begins with its power-on there too."""
+    runs, half = np.repeat([1.0, 2.0], ROWS // 2), ROWS // 2
+    time = STEP * np.arange(ROWS) + 3600.0 * (runs > 1)
+    course = slower(mission(temperature=RAMP).with_column("run", runs, "1").with_column("time", time, "s"))
     assert course.columns["run"].tolist() == np.repeat([1.0, 2.0], ROWS).tolist()
-    assert np.diff(course.columns["temperature"])[:-1] == pytest.approx(0.5 * (RAMP[1] - RAMP[0]))
+    rises = np.diff(course.columns["temperature"])[:-1]
+    assert np.delete(rises, [ROWS - 2, ROWS - 1]) == pytest.approx(0.5 * (RAMP[1] - RAMP[0]))
+    assert rises[ROWS - 2 : ROWS] == pytest.approx([0.0, RAMP[1] - RAMP[0]])
+    on = np.asarray(read_signals(course.with_column("output", np.arange(2.0 * ROWS), "deg/s")).signals["time_on"])
+    assert on[: 2 * ROWS].tolist() == [*(STEP * np.arange(2 * half)), *(STEP * np.arange(2 * half))]
 
 
 def test_draws_bear_the_first_order_out_and_shares_add_up(seed: int):

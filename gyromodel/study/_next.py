@@ -15,7 +15,7 @@ from gyromodel.diagnosis import added_tests
 from gyromodel.effects import Effect
 from gyromodel.estimate import check_covariates, filter_of, given_ratios, whiten_columns
 from gyromodel.model import GyroModel, ModelError, check_units
-from gyromodel.signals import read_signals, with_columns_known
+from gyromodel.signals import OFF, read_signals, with_columns_known
 from gyromodel.study._budget import Budget
 from gyromodel.study._instruments import Instrument, output_by_column
 from gyromodel.study._known import Known
@@ -126,15 +126,21 @@ def blocks(parts: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def slower(campaign: Campaign) -> Campaign:
-    """Everything a campaign does at half the speed: soaks and ramps twice as long."""
-    rows = np.arange(2 * len(campaign))
+    """Everything a campaign does at half the speed: soaks and ramps twice as long, gaps as they are."""
     time = campaign.columns["time"]
-    step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+    steps = np.diff(time)
+    usual = float(np.median(steps)) if len(steps) else 1.0
+    gap = steps > OFF * usual
+    # Each row, and one half-way to the next or, before a gap, the same again.
+    steps = np.column_stack([np.where(gap, usual, steps), steps]).ravel()
+    rows = np.arange(2 * len(campaign))
+    at = rows / 2.0 - 0.5 * np.append(np.column_stack([np.zeros_like(gap), gap]).ravel(), [0, 0])
     columns = {name: values[rows // 2] for name, values in campaign.columns.items()}
     for name in campaign.covariates:
         if name not in NUMBERED:
-            columns[name] = np.interp(rows / 2.0, np.arange(len(campaign)), campaign.columns[name])
-    return Campaign(columns | {"time": time[0] + step * rows}, campaign.units, campaign.metadata, campaign.name)
+            columns[name] = np.interp(at, np.arange(len(campaign)), campaign.columns[name])
+    columns["time"] = time[0] + np.cumsum([0.0, *steps, usual])
+    return Campaign(columns, campaign.units, campaign.metadata, campaign.name)
 
 
 def next_tests(
