@@ -20,7 +20,7 @@ def entries(name: str | None) -> list[dict[str, Any]]:
         return [asdict(entry) for entry in every.values()]
     if name not in every:
         close = " or ".join(get_close_matches(name, every, n=3))
-        if not name.startswith("bias_"):
+        if not name.removeprefix("bias_") or not name.startswith("bias_"):
             hint = f"; did you mean {close}?" if close else "; `gyromodel effects` lists them"
             raise typer.BadParameter(f"no effect is called {name}{hint}", param_hint="ID")
         hint = f"; or did you mean {close}?" if close else ""

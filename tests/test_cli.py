@@ -187,6 +187,7 @@ def test_the_module_runs_as_a_program():
         ["allan", "campaign.csv"],
         ["allan", "campaign.csv", "-o", "out", "--axis", "w"],
         ["effects", "scale_temprature"],
+        ["effects", "bias_"],
         ["effects", "--unknown"],
     ],
 )

@@ -179,6 +179,11 @@ def test_noise_alone_passes_the_safe_threshold_as_seldom_in_few_samples(nu: int,
     assert 1e-4 < stats.beta.sf(part, columns / 2, (nu - columns) / 2) < 1e-3
 
 
+@pytest.mark.parametrize("nu", [2, 3])
+def test_with_two_or_three_degrees_of_freedom_only_all_would_be_enough(nu: int) -> None:
+    assert explained_for(safe_threshold(nu), nu, 2) == pytest.approx(nu)
+
+
 def test_explained_for_inverts_the_evidence() -> None:
     t = explained_for(5.0, 900, 1)
     assert float(log_evidence_ratio(np.array(t), 900.0, 900, 1)) == pytest.approx(5.0, abs=1e-6)
