@@ -33,7 +33,6 @@ def scores(flicker: float, walk: float, draws: int, effects: list[str]) -> np.nd
     from gyromodel.diagnosis._calibrate import null_scores
     from gyromodel.diagnosis._scan import Scanner
     from gyromodel.estimate import fit_record
-    from gyromodel.model import record_span
     from gyromodel.noise import NoiseRatios, noise_grid
     from gyromodel.plan import read_plan
     from gyromodel.signals import read_signals
@@ -50,7 +49,7 @@ def scores(flicker: float, walk: float, draws: int, effects: list[str]) -> np.nd
         np.asarray(noise["noise_random_walk"] ** 2 * record.interval / variance),
     )
     baseline = fit_record(record, model, ratios=ratios)
-    grid = noise_grid(int(record.present.sum()), record.interval, record_span(record))
+    grid = noise_grid(int(record.present.sum()), record.interval, record.span)
     return null_scores(Scanner(record, build_bank(record), grid), baseline, draws, 1, lambda line, done: None)
 
 

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from gyromodel.files import write_campaign as write_campaign
     from gyromodel.model import GyroModel as GyroModel
     from gyromodel.model import model_from_effects as model_from_effects
-    from gyromodel.model import simulate as simulate
     from gyromodel.model_files import read_calibration as read_calibration
     from gyromodel.model_files import read_model as read_model
     from gyromodel.model_files import write_model as write_model
@@ -38,6 +37,7 @@ if TYPE_CHECKING:
     from gyromodel.numerics.uncertain import Uncertain as Uncertain
     from gyromodel.numerics.uncertain import together as together
     from gyromodel.report import write_report as write_report
+    from gyromodel.simulation import simulate as simulate
     from gyromodel.units import UnitError as UnitError
 
 __version__ = "0.1.0"
@@ -64,7 +64,7 @@ _MODULE_OF = {
     "read_calibration": "model_files",
     "read_campaign": "files",
     "read_model": "model_files",
-    "simulate": "model",
+    "simulate": "simulation",
     "together": "numerics.uncertain",
     "two_stage": "estimate",
     "write_campaign": "files",

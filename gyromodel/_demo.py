@@ -9,9 +9,9 @@ from gyromodel._atomic import write_text
 from gyromodel._console import print_paths, read_campaigns
 from gyromodel._diagnose_files import REPORTS, diagnose_to
 from gyromodel.files import write_campaign
-from gyromodel.model import simulate
 from gyromodel.model_files import read_model
 from gyromodel.plan import read_plan
+from gyromodel.simulation import simulate
 
 DATA = Path(__file__).parent / "data"
 TITLES = {

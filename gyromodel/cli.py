@@ -172,9 +172,9 @@ def simulate(
         raise typer.BadParameter("give either --like CAMPAIGN or --plan PLAN.yaml", param_hint="--like")
     refuse_overwriting(output, [model, pattern_file])
     from gyromodel.files import SUFFIXES, read_campaign, write_campaign
-    from gyromodel.model import simulate as simulate_campaign
     from gyromodel.model_files import read_model
     from gyromodel.plan import read_plan
+    from gyromodel.simulation import simulate as simulate_campaign
 
     refuse_suffix(output, SUFFIXES)
     simulated_by = read_model(model)

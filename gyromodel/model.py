@@ -16,15 +16,13 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from gyromodel._checks import of_usual_unit, usual_unit
-from gyromodel.campaign import Campaign
 from gyromodel.declarations import column_of
 from gyromodel.effects import CATALOGUE, Effect, Signals
 from gyromodel.effects._base import Domain, evaluate, lacking
 from gyromodel.effects.drivers import BiasColumn
-from gyromodel.noise import NOISE_UNITS, NoiseRatios, markov_sum, stated_ratios
-from gyromodel.numerics.state_space import build_filter, colour
-from gyromodel.signals import Record, domain_of, read_signals
-from gyromodel.units import convertible, from_internal
+from gyromodel.noise import NOISE_UNITS
+from gyromodel.signals import domain_of
+from gyromodel.units import convertible
 
 # A local slope below this part of the gain is a dead band's.
 DEAD = 0.05
@@ -372,60 +370,3 @@ def check_units(model: GyroModel, output_unit: str, units: Mapping[str, str]) ->
             given = "a plain number" if written == "1" else f"in {written}"
             expected = " or ".join("a plain number" if unit == "1" else unit for unit in accepted)
             raise ModelError(f"{effect.label} is {given}, but {what}: expected {expected}")
-
-
-def simulate(model: GyroModel, campaign: Campaign, seed: int = 0) -> Campaign:
-    """The campaign with its output replaced by the model's, with a draw of the noise that the model states, if any.
-
-    Args:
-        model: with the values of all effects.
-        campaign: time, columns and the output's unit and kind; without an output, a rate in deg/s.
-        seed: of the noise.
-
-    Raises:
-        CampaignError: it is no campaign of one gyro.
-        ModelError: the model misses a value or a column, or what it states of the noise is none.
-    """
-    if not campaign.outputs:
-        campaign = campaign.with_column("output", np.arange(len(campaign), dtype=float), "deg/s")
-    record = read_signals(campaign)
-    unset = [e.label for e in model.effects if not np.isfinite(np.asarray(e.linear())).all()]
-    if unset:
-        raise ModelError(f"effect {unset[0]} has no value; fit the model or write one to simulate")
-    check_units(model, record.output_unit, record.units)
-    model = model.prepared(record.signals)
-    output = np.asarray(model.predict(record.signals))[: record.rows]
-    output = output + draw_noise(model, record, np.random.default_rng(seed))
-    kind = campaign.metadata.get("kind", "rate")
-    if kind != "rate":
-        step = np.diff(campaign.si("time"))
-        output = output * np.concatenate([[np.median(step)], step])
-        output = np.cumsum(output) if kind == "angle" else output
-    return campaign.with_column("output", from_internal(output, campaign.units["output"]), campaign.units["output"])
-
-
-def draw_noise(model: GyroModel, record: Record, rng: np.random.Generator) -> np.ndarray:
-    """One draw of the model's noise in output units, through the same state-space form that whitens it."""
-    if not model.noise:
-        return np.zeros(record.rows)
-    try:
-        ratios = stated_ratios(model.noise, record.interval)
-    except ValueError as problem:
-        raise ModelError(str(problem)) from None
-    variance = float(model.noise["noise_white"]) ** 2 / record.interval
-    draws = jnp.asarray(rng.standard_normal(len(record.sampling.present)))
-    sampling = record.sampling._replace(present=jnp.ones_like(record.sampling.present))
-    longest = float(ratios.longest(record_span(record)))
-    noise = _realise(ratios, record.interval, longest, sampling, draws)
-    return np.asarray(noise)[: record.rows] * np.sqrt(variance) * abs(float(model.gain()))
-
-
-@jax.jit
-def _realise(ratios: NoiseRatios, interval, longest, sampling, draws):
-    return colour(build_filter(markov_sum(ratios, interval, longest), sampling), draws)
-
-
-def record_span(record: Record) -> float:
-    """Time from first to last sample (s), at least two intervals."""
-    time = np.asarray(record.signals["time"])[: record.rows]
-    return float(max(np.max(time) - np.min(time), 2 * record.interval))

@@ -66,6 +66,12 @@ class Record(NamedTuple):
         return "rad" if self.domain == "platform" else "rad/s"
 
     @property
+    def span(self) -> float:
+        """Time from first to last sample (s), at least two intervals."""
+        time = np.asarray(self.signals["time"])[: self.rows]
+        return float(max(np.max(time) - np.min(time), 2 * self.interval))
+
+    @property
     def present(self) -> np.ndarray:
         """Real rows with an output."""
         return np.asarray(self.sampling.present)[: self.rows]

@@ -42,7 +42,6 @@ from gyromodel.diagnosis._verdict import _as_set
 from gyromodel.effects.drivers import BiasStep
 from gyromodel.effects.thermal import BiasWarmup
 from gyromodel.estimate import EstimateError, fit_record
-from gyromodel.model import record_span
 from gyromodel.noise import NoiseGrid, NoiseRatios, markov_sum, noise_grid
 from gyromodel.signals import read_signals
 from tests.truth import study
@@ -89,7 +88,7 @@ def test_search_statistics_equal_dense_algebra(rng: np.random.Generator, lengths
         ]
     )
     rows, run = sum(lengths), np.repeat(np.arange(len(lengths)), lengths)
-    span = record_span(record)
+    span = record.span
     ratios = NoiseRatios(jnp.array([0.05]), jnp.array([0.01]))
     grid = NoiseGrid(ratios, np.zeros(1), record.interval, span)
     scanner = Scanner(record, build_bank(record), grid)
@@ -246,7 +245,7 @@ def test_calibration_is_kept_by_design(rng: np.random.Generator, tmp_path, monke
     white = NoiseRatios(jnp.zeros(()), jnp.zeros(()))
     baseline = fit_record(record, gm.model_from_effects(["bias"]), ratios=white)
     ratios = NoiseRatios(jnp.zeros(1), jnp.zeros(1))
-    grid = NoiseGrid(ratios, np.zeros(1), record.interval, record_span(record))
+    grid = NoiseGrid(ratios, np.zeros(1), record.interval, record.span)
     scanner = Scanner(record, build_bank(record), grid)
     said: list[str] = []
     scores = null_scores(scanner, baseline, 128, 1, lambda line, done: said.append(line))
@@ -259,7 +258,7 @@ def test_calibration_is_kept_by_design(rng: np.random.Generator, tmp_path, monke
     # The same test once more, its noise and what wanders by itself other; and a test half as long.
     for again, new in ((static_log(rng), False), (static_log(rng).select(slice(ROWS // 2)), True)):
         record = read_signals(again)
-        other = Scanner(record, build_bank(record), grid._replace(interval=record.interval, span=record_span(record)))
+        other = Scanner(record, build_bank(record), grid._replace(interval=record.interval, span=record.span))
         alike = fit_record(record, gm.model_from_effects(["bias"]), ratios=white)
         null_scores(other, alike, 128, 1, lambda line, done: said.append(line))
         assert (len(said) > drawn) == new
@@ -271,7 +270,7 @@ def test_calibration_draws_meet_the_noise_cells_they_need(flicker: float, walk: 
     record = read_signals(static_log(np.random.default_rng(7)))
     ratios = NoiseRatios(jnp.asarray(flicker), jnp.asarray(walk))
     baseline = fit_record(record, gm.model_from_effects(["bias"]), ratios=ratios)
-    grid = noise_grid(record.rows, record.interval, record_span(record))
+    grid = noise_grid(record.rows, record.interval, record.span)
     scanner = Scanner(record, build_bank(record), grid)
     points = []
     for place in ("some", "all"):
@@ -305,7 +304,7 @@ def test_a_fold_does_not_search_what_only_the_rows_left_out_would_tell(rng: np.r
     """A warm-up that was over before the fold begins is a pulse in its first row, of an amplitude beyond bounds."""
     record = read_signals(static_log(rng))
     ratios = NoiseRatios(jnp.zeros(1), jnp.zeros(1))
-    grid = NoiseGrid(ratios, np.zeros(1), record.interval, record_span(record))
+    grid = NoiseGrid(ratios, np.zeros(1), record.interval, record.span)
     first = record.rows // 5
     fold = Scanner(record, build_bank(record), grid).without(np.arange(first), [0])
     residual = rng.standard_normal(len(fold.present))
@@ -452,7 +451,7 @@ def test_line_energies_are_the_whitened_ones(rng: np.random.Generator) -> None:
     """At every frequency, in white noise and in a random walk; there a cosine begins with a jump, a sine with none."""
     record = read_signals(static_log(rng))
     ratios = NoiseRatios(jnp.array([0.0, 0.0, 0.3]), jnp.array([0.0, 0.5, 0.0]))
-    scanner = Scanner(record, build_bank(record), NoiseGrid(ratios, np.zeros(3), record.interval, record_span(record)))
+    scanner = Scanner(record, build_bank(record), NoiseGrid(ratios, np.zeros(3), record.interval, record.span))
     assert scanner.lines is not None
     waves = scanner.lines.waves(np.arange(len(scanner.lines.frequencies)))
     for g in range(3):
@@ -466,7 +465,7 @@ def test_many_residuals_at_once_are_searched_like_each_alone(rng: np.random.Gene
     """Few residuals are searched in several noise cells side by side, many in one cell at a time."""
     record = read_signals(static_log(rng))
     ratios = NoiseRatios(jnp.array([0.0, 0.3, 0.3]), jnp.array([0.0, 0.0, 0.5]))
-    grid = NoiseGrid(ratios, np.zeros(3), record.interval, record_span(record))
+    grid = NoiseGrid(ratios, np.zeros(3), record.interval, record.span)
     scanner = Scanner(record, build_bank(record), grid)
     jacobian = np.where(scanner.present, 1.0, 0.0)[:, None]
     residuals = rng.normal(size=(len(jacobian), 20)) * jacobian
@@ -489,7 +488,7 @@ def test_the_interval_of_an_epoch_holds_it(size: float, walk: float) -> None:
     log = log.select(np.delete(np.arange(ROWS), rng.choice(np.arange(1, ROWS - 1), 20, replace=False)))
     record = read_signals(log)
     ratios = NoiseRatios(jnp.array([0.0]), jnp.array([walk**2]))
-    scanner = Scanner(record, build_bank(record), NoiseGrid(ratios, np.zeros(1), record.interval, record_span(record)))
+    scanner = Scanner(record, build_bank(record), NoiseGrid(ratios, np.zeros(1), record.interval, record.span))
     time, scale = log.columns["time"] - log.columns["time"][0], np.deg2rad(1 / 3600)
     drift = walk * np.sqrt(np.diff(time, prepend=0.0) / 20.0)
     held, stds = 0, []

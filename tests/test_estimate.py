@@ -13,10 +13,11 @@ from gyromodel.effects.drivers import Bias, BiasDrift
 from gyromodel.effects.scale import ScaleFactor
 from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureCurve, BiasWarmup
 from gyromodel.estimate import Estimate, EstimateError, _fit, fit, fit_record, two_stage, with_noise_intervals
-from gyromodel.model import GyroModel, ModelError, draw_noise, model_from_effects, record_span
+from gyromodel.model import GyroModel, ModelError, model_from_effects
 from gyromodel.noise import NoiseRatios, markov_sum
 from gyromodel.numerics.least_squares import Solution
 from gyromodel.signals import Record, read_signals
+from gyromodel.simulation import draw_noise
 from tests.test_state_space import covariance
 
 ROWS, STEP = 256, 20.0
@@ -49,7 +50,7 @@ def linear_model() -> GyroModel:
 def dense(record: Record, ratios: NoiseRatios) -> np.ndarray:
     """Noise covariance of the rows present, in units of the white variance."""
     here = np.asarray(record.sampling.present)
-    return covariance(markov_sum(ratios, record.interval, record_span(record)), record.sampling)[np.ix_(here, here)]
+    return covariance(markov_sum(ratios, record.interval, record.span), record.sampling)[np.ix_(here, here)]
 
 
 def regression(record: Record, model: GyroModel) -> tuple[np.ndarray, np.ndarray]:

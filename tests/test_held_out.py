@@ -12,7 +12,6 @@ import gyromodel as gm
 from gyromodel.diagnosis import _session
 from gyromodel.diagnosis._gain import _summary, folds_of, held_out
 from gyromodel.estimate import fit_record
-from gyromodel.model import record_span
 from gyromodel.noise import NoiseRatios
 from gyromodel.signals import read_signals
 from tests.test_diagnosis import dense_covariance
@@ -61,7 +60,7 @@ def test_scores_equal_dense_algebra(rng: np.random.Generator, walk: float):
     errors, score = held_out(record, train, rows)
     time = np.asarray(record.signals["time"])[: record.rows]
     run = np.zeros(record.rows)
-    noise = dense_covariance(ratios, record.interval, record_span(record), time, run) * train.white_variance
+    noise = dense_covariance(ratios, record.interval, record.span, time, run) * train.white_variance
     predicted, columns = (np.asarray(part)[: record.rows] for part in train.model.linearise(record.signals))
     residual = np.asarray(record.signals["output"])[: record.rows] - predicted
     others = np.setdiff1d(np.arange(record.rows), rows)

@@ -21,14 +21,13 @@ from gyromodel.model import (
     GyroModel,
     ModelError,
     check_units,
-    draw_noise,
     effect_class,
     make_effect,
     model_from_effects,
     parameter_unit,
-    simulate,
 )
 from gyromodel.signals import Record, read_signals
+from gyromodel.simulation import draw_noise, simulate
 
 ROWS, STEP = 256, 20.0
 RARE = 1e-5

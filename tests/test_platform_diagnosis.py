@@ -24,7 +24,8 @@ from gyromodel.diagnosis import Diagnosis
 from gyromodel.diagnosis._misfit import axis_probabilities, unexplained_axes
 from gyromodel.effects import CATALOGUE
 from gyromodel.effects._base import evaluate
-from gyromodel.effects.platform import ENCODERS, SHAFTS, TILTS, EncoderHarmonic, ShaftFriction
+from gyromodel.effects.platform import SHAFTS, ShaftFriction
+from gyromodel.effects.platform_gimbals import ENCODERS, TILTS, EncoderHarmonic
 from gyromodel.estimate import fit_record
 from gyromodel.files import read_campaign
 from gyromodel.model import GyroModel, ModelError, make_effect, model_from_effects

@@ -93,6 +93,36 @@ class Bank:
         return {q: (widths.index(q), widths.count(q), self.blocks[widths.index(q)].start) for q in sorted(set(widths))}
 
 
+class BlockTable:
+    """A bank's blocks as arrays, and the order in which those of a name and, within it, of a structure lie together.
+
+    `smallest` is the smallest coefficient of a positive effect.
+    """
+
+    def __init__(self, bank: Bank) -> None:
+        parts: dict[str, dict[str, list[int]]] = {}
+        for i, block in enumerate(bank.blocks):
+            parts.setdefault(block.name, {}).setdefault(block.structure, []).append(i)
+        structures = [blocks for of_name in parts.values() for blocks in of_name.values()]
+        self.names = list(parts)
+        self.order = np.array([i for blocks in structures for i in blocks], int)
+        self.structure_starts = np.cumsum([0, *map(len, structures)])[:-1]
+        self.name_starts = np.cumsum([0, *map(len, parts.values())])[:-1]
+        self.drivers = np.array([b.kind == "driver" for b in bank.blocks], bool)
+        self.positive = np.array([b.effect is not None and b.effect.positive for b in bank.blocks])
+        self.smallest = np.array([b.least for b in bank.blocks])
+        self.price = np.array([b.price for b in bank.blocks])
+        self._blocks = [b.name for b in bank.blocks]
+        self._widths = np.array([b.width for b in bank.blocks], int)
+        self._grown = np.array([b.effect is not None and b.effect.grown for b in bank.blocks])
+
+    def least(self, contained: dict[str, int]) -> np.ndarray:
+        """How many columns of each block must be left beside a baseline that has so many of a name's."""
+        spare = np.array([contained.get(name, 0) for name in self._blocks])
+        least = np.where(self.drivers, 1, np.maximum(self._widths - spare, 1))
+        return np.where(self._grown & (spare == 0), self._widths + 1, least)
+
+
 def _usable(record: Record) -> dict[str, Array]:
     """Signals less the columns that catalogue effects cannot take for their unit."""
     return {n: v for n, v in record.signals.items() if of_usual_unit(n, record.units.get(n, usual_unit(n)))}

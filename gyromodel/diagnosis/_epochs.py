@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from gyromodel.diagnosis._cells import COLUMN_STEP, precision
-from gyromodel.diagnosis._scan import VANISHED, Scanner
+from gyromodel.diagnosis._scan import Scanner
+from gyromodel.diagnosis._tangents import VANISHED
 from gyromodel.effects.drivers import BiasStep
 from gyromodel.estimate import Estimate
 

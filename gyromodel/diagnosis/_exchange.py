@@ -15,7 +15,6 @@ from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, is_driver, is_no
 from gyromodel.diagnosis._steps import EXCHANGE, Found, Steps, standing
 from gyromodel.effects.drivers import BiasPeriodic
 from gyromodel.estimate import Estimate
-from gyromodel.model import record_span
 
 # Lines that lead every other name by this much (nats) are not chosen again.
 LINE_LEAD = 20.0
@@ -129,7 +128,7 @@ def steady(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[list[F
 
     Where these are the stronger, no line stands: the others are parts of the same.
     """
-    given, changing, far = lines_of(steps.baseline.model), list[float](), 1.0 / record_span(estimate.record)
+    given, changing, far = lines_of(steps.baseline.model), list[float](), 1.0 / estimate.record.span
     while any(f.name == "bias_periodic" for f in found):
         lines, effect = lines_of(estimate.model), estimate.model.effects[estimate.model.labels.index("bias_periodic")]
         assert isinstance(effect, BiasPeriodic)
@@ -170,7 +169,7 @@ def unresolved(estimate: Estimate, step: Found, reading: float) -> str:
     """
     model, record = estimate.model, estimate.record
     pairs = combinations(lines_of(model), 2)
-    if step.name == "bias_periodic" and any(near(one, other, 0.5 / record_span(record)) for one, other in pairs):
+    if step.name == "bias_periodic" and any(near(one, other, 0.5 / record.span) for one, other in pairs):
         return f"{step.name} would have lines that the record cannot resolve: one that is not steady, and is not named."
     if record.domain == "gyro" or step.effect is None or step.effect.label not in model.labels:
         return ""

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.fft
 
 from gyromodel.effects.drivers import BiasPeriodic
-from gyromodel.model import GyroModel, record_span
+from gyromodel.model import GyroModel
 from gyromodel.signals import Record
 
 # A line's energy is computed exactly at the lowest frequencies, at log-spaced ones to interpolate between, and at the
@@ -130,7 +130,7 @@ class LineGrid:
 def line_grid(record: Record) -> LineGrid | None:
     """A quarter of the record's resolution, up to half the sample rate; None where that leaves no frequency."""
     time = np.asarray(record.signals["time"])
-    span = record_span(record)
+    span = record.span
     grid = record.interval
     if np.abs(time[: record.rows] / grid - np.round(time[: record.rows] / grid)).max() > 0.1:
         grid /= 4.0

@@ -14,7 +14,6 @@ from scipy.stats import chi2, f, norm
 from gyromodel.campaign import AXES
 from gyromodel.diagnosis._lines import lines_of, near
 from gyromodel.estimate import Estimate, filter_of, whiten_columns
-from gyromodel.model import record_span
 
 # Probability below which what is left is no noise.
 SELDOM = 1e-4
@@ -90,7 +89,7 @@ def unsteady_lines(estimate: Estimate) -> list[bool]:
         own = [i for i, s in slots if s.linear and s.index == k and model.labels[s.effect] == "bias_periodic"]
         steady = values[own] @ np.linalg.solve(estimate.covariance[np.ix_(own, own)], values[own])
         seldom = chi2.sf(changing, left.shape[1]) * len(lines) < SELDOM
-        beside = any(near(lines[k], other, NEAR / record_span(record)) for other in lines[:k] + lines[k + 1 :])
+        beside = any(near(lines[k], other, NEAR / record.span) for other in lines[:k] + lines[k + 1 :])
         found.append(beside or bool(seldom and changing > UNSTEADY * (changing + steady)))
     return found
 

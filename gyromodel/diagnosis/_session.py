@@ -19,7 +19,7 @@ from gyromodel.diagnosis._search import Progress, Selection, search, significant
 from gyromodel.diagnosis._steps import EXCHANGE, NoisePath, Steps, standing
 from gyromodel.diagnosis._variance import with_variance
 from gyromodel.estimate import Estimate, EstimateError, fit_record
-from gyromodel.model import GyroModel, record_span
+from gyromodel.model import GyroModel
 from gyromodel.noise import NoiseGrid, NoiseRatios, noise_grid
 from gyromodel.signals import Record, with_columns_known, with_smooth_thermometers
 
@@ -157,7 +157,7 @@ def over_weighted(
 
 def _grid(record: Record, baseline: Estimate) -> NoiseGrid:
     """Noise cells: the whole family; where the model states its noise, that cell first."""
-    grid = noise_grid(int(record.present.sum()), record.interval, record_span(record))
+    grid = noise_grid(int(record.present.sum()), record.interval, record.span)
     if not baseline.noise_given:
         return grid
     stated, prior = baseline.ratios, grid.log_prior

@@ -17,7 +17,7 @@ from gyromodel.campaign import Campaign
 from gyromodel.estimate._estimate import Estimate, EstimateError, noise_coefficients
 from gyromodel.estimate._noise import best_ratios, settled, with_noise_intervals
 from gyromodel.estimate._optimistix import optimistix_solution
-from gyromodel.model import GyroModel, ModelError, check_domain, check_units, record_span
+from gyromodel.model import GyroModel, ModelError, check_domain, check_units
 from gyromodel.noise import NoiseRatios, from_grams, markov_sum, stated_ratios
 from gyromodel.numerics.least_squares import Normal, Solution, levenberg_marquardt
 from gyromodel.numerics.state_space import Filter, build_filter, colour, whiten, whitened_gram
@@ -190,7 +190,7 @@ def make_filter(ratios: NoiseRatios, interval, longest, sampling) -> Filter:
 def filter_of(record: Record, ratios: NoiseRatios) -> Filter:
     """The whitening filter of one noise cell on a record."""
     ratios = NoiseRatios(*(np.asarray(r, float) for r in ratios))
-    return make_filter(ratios, record.interval, float(ratios.longest(record_span(record))), record.sampling)
+    return make_filter(ratios, record.interval, float(ratios.longest(record.span)), record.sampling)
 
 
 whiten_columns = jax.jit(whiten)

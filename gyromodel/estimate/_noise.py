@@ -9,7 +9,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 
 from gyromodel.estimate._estimate import Estimate, noise_coefficients
-from gyromodel.model import GyroModel, record_span
+from gyromodel.model import GyroModel
 from gyromodel.noise import NoiseRatios, markov_cells, noise_grid, restricted_likelihood
 from gyromodel.signals import Record
 
@@ -38,7 +38,7 @@ def best_ratios(
     """
     predicted, jacobian = model.linearise(record.signals)
     residual = np.where(record.sampling.present, np.asarray(record.signals["output"]) - predicted, 0.0)
-    span = record_span(record)
+    span = record.span
 
     def likelihood(cells: NoiseRatios) -> np.ndarray:
         args = (record.interval, span, record.sampling, jacobian, residual)
@@ -107,7 +107,7 @@ def with_noise_intervals(estimate: Estimate) -> Estimate:
     record, gain = estimate.record, float(estimate.model.gain())
     predicted, jacobian = estimate.model.linearise(record.signals)
     residual = np.where(record.sampling.present, np.asarray(record.signals["output"]) - predicted, 0.0)
-    span = record_span(record)
+    span = record.span
     samples = int(record.present.sum())
     grid = noise_grid(samples, record.interval, span).ratios
     if float(estimate.ratios.markov) > 0:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from gyromodel._compiling import former_fusions
 from gyromodel.estimate._blocks import BLOCK, Blocks, gram_of, in_turn
 from gyromodel.estimate._fit import check_enough, given_ratios
-from gyromodel.model import GyroModel, check_units, record_span
+from gyromodel.model import GyroModel, check_units
 from gyromodel.noise import NoiseRatios, markov_sum
 from gyromodel.numerics.compiled_least_squares import Search, search_minimum
 from gyromodel.numerics.state_space import Sampling, build_filter
@@ -134,7 +134,7 @@ def side_by_side(campaigns: list[Waiting], blocks: int, memory: Memory) -> SideB
         white = padded("_white", (r.sampling.white for r in own)).reshape(flat)
         present = padded("_present", (r.sampling.present for r in own), 0.0).reshape(flat)
         ratios = [c.ratios for c in campaigns if c.ratios is not None]
-        longest = [float(r.longest(record_span(record))) for r, record in zip(ratios, records, strict=True)]
+        longest = [float(r.longest(record.span)) for r, record in zip(ratios, records, strict=True)]
         parts: list[Any] = [interval, restart, present, white]
         noise = _Noise(_stacked(ratios), np.array(longest), Sampling(*parts))
     return SideBySide(

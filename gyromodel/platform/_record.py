@@ -17,7 +17,8 @@ from jaxtyping import Array, Float
 
 from gyromodel._checks import CampaignError
 from gyromodel.campaign import AXES, Campaign
-from gyromodel.effects.platform import ODD, ORDERS, SHAFTS, TILTS
+from gyromodel.effects.platform import ODD, SHAFTS
+from gyromodel.effects.platform_gimbals import ORDERS, TILTS
 from gyromodel.estimate import Estimate, fit_record, with_noise_intervals
 from gyromodel.model import GyroModel
 from gyromodel.numerics.rotations import exponential, product

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from gyromodel.estimate import make_filter
-from gyromodel.model import ModelError, record_span
+from gyromodel.model import ModelError
 from gyromodel.noise import NoiseRatios, markov_sum, stated_ratios
 from gyromodel.numerics.state_space import colour
 from gyromodel.signals import Record
@@ -228,7 +228,7 @@ def _each_axis(mission: Mission, record: Record, rows: np.ndarray | None) -> tup
             ratios = stated_ratios(model.noise, record.interval)
         except ValueError as problem:
             raise ModelError(str(problem)) from None
-        span = record_span(record)
+        span = record.span
         white = float(model.noise["noise_white"]) ** 2 / record.interval
         ratios = NoiseRatios(*(np.asarray(r, float) for r in ratios))
         none = NoiseRatios(np.zeros(()), np.zeros(()), np.zeros(()), ratios.constant)

@@ -1,0 +1,65 @@
+"""A campaign as a model would have measured it, with its noise."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gyromodel.campaign import Campaign
+from gyromodel.model import GyroModel, ModelError, check_units
+from gyromodel.noise import NoiseRatios, markov_sum, stated_ratios
+from gyromodel.numerics.state_space import build_filter, colour
+from gyromodel.signals import Record, read_signals
+from gyromodel.units import from_internal
+
+
+def simulate(model: GyroModel, campaign: Campaign, seed: int = 0) -> Campaign:
+    """The campaign with its output replaced by the model's, with a draw of the noise that the model states, if any.
+
+    Args:
+        model: with the values of all effects.
+        campaign: time, columns and the output's unit and kind; without an output, a rate in deg/s.
+        seed: of the noise.
+
+    Raises:
+        CampaignError: it is no campaign of one gyro.
+        ModelError: the model misses a value or a column, or what it states of the noise is none.
+    """
+    if not campaign.outputs:
+        campaign = campaign.with_column("output", np.arange(len(campaign), dtype=float), "deg/s")
+    record = read_signals(campaign)
+    unset = [e.label for e in model.effects if not np.isfinite(np.asarray(e.linear())).all()]
+    if unset:
+        raise ModelError(f"effect {unset[0]} has no value; fit the model or write one to simulate")
+    check_units(model, record.output_unit, record.units)
+    model = model.prepared(record.signals)
+    output = np.asarray(model.predict(record.signals))[: record.rows]
+    output = output + draw_noise(model, record, np.random.default_rng(seed))
+    kind = campaign.metadata.get("kind", "rate")
+    if kind != "rate":
+        step = np.diff(campaign.si("time"))
+        output = output * np.concatenate([[np.median(step)], step])
+        output = np.cumsum(output) if kind == "angle" else output
+    return campaign.with_column("output", from_internal(output, campaign.units["output"]), campaign.units["output"])
+
+
+def draw_noise(model: GyroModel, record: Record, rng: np.random.Generator) -> np.ndarray:
+    """One draw of the model's noise in output units, through the same state-space form that whitens it."""
+    if not model.noise:
+        return np.zeros(record.rows)
+    try:
+        ratios = stated_ratios(model.noise, record.interval)
+    except ValueError as problem:
+        raise ModelError(str(problem)) from None
+    variance = float(model.noise["noise_white"]) ** 2 / record.interval
+    draws = jnp.asarray(rng.standard_normal(len(record.sampling.present)))
+    sampling = record.sampling._replace(present=jnp.ones_like(record.sampling.present))
+    longest = float(ratios.longest(record.span))
+    noise = _realise(ratios, record.interval, longest, sampling, draws)
+    return np.asarray(noise)[: record.rows] * np.sqrt(variance) * abs(float(model.gain()))
+
+
+@jax.jit
+def _realise(ratios: NoiseRatios, interval, longest, sampling, draws):
+    return colour(build_filter(markov_sum(ratios, interval, longest), sampling), draws)
