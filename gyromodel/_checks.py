@@ -15,6 +15,8 @@ from gyromodel import units as unit_system
 # Signals that models see besides the columns: time since power-on, and the rate of each thermometer.
 DERIVED = re.compile(r"time_on|temperature(_.+)?_rate")
 _THERMOMETER = re.compile(r"temperature(_.+)?(?<!_rate)")
+# Columns that number stretches of a campaign.
+NUMBERED = ("segment", "run", "position")
 KINDS = ("rate", "increment", "angle")
 MAX_METADATA = 10_000
 # A step in time of more than this many nominal ones leaves out samples.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gyromodel._checks import NUMBERED
 from gyromodel.campaign import Campaign
 from gyromodel.signals import GAP, rate_output
 from gyromodel.units import factor, from_internal, is_angle
@@ -42,7 +43,7 @@ def average(campaign: Campaign, maximum: int = MAXIMUM_ROWS, seconds: float = 0.
         campaign = _as_rate(campaign)
     step = np.diff(time)
     breaks = np.concatenate([[False], step > GAP * np.median(step)])
-    for name in ("segment", "run", "position"):
+    for name in NUMBERED:
         if name in campaign.columns:
             breaks |= np.concatenate([[False], np.diff(campaign.columns[name]) != 0])
     stretch = np.cumsum(breaks)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from gyromodel._checks import MISSING_STEP, CampaignError, thermometers
+from gyromodel._checks import MISSING_STEP, NUMBERED, CampaignError, thermometers
 from gyromodel.campaign import Campaign
 from gyromodel.effects._base import Domain
 from gyromodel.numerics.smoothing import smooth_derivative, smooth_values
@@ -159,7 +159,7 @@ def _blocks(campaign: Campaign, time: np.ndarray) -> tuple[np.ndarray, str]:
     stretches = stretches_of(time)
     if 4 <= stretches.max() + 1 <= 60:
         return stretches, "stretches between gaps"
-    for name in ("segment", "run", "position"):
+    for name in NUMBERED:
         if name in campaign.columns:
             values = campaign.columns[name]
             numbers = np.unique(values, return_inverse=True)[1]

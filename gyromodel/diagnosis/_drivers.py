@@ -10,7 +10,7 @@ import re
 
 import numpy as np
 
-from gyromodel._checks import DERIVED, thermometers
+from gyromodel._checks import DERIVED, NUMBERED, thermometers
 from gyromodel.declarations import RATE_OF, measured
 from gyromodel.signals import Record
 
@@ -19,7 +19,7 @@ RESPONSE_DRIVER = f"smooth({RATE_OF.format('rate')})"
 # four standard errors, as neighbouring second differences of noise are alike. How many times their median are no jump.
 ALIKE, CERTAIN, NO_JUMP = 0.1, 5.6, 4.0
 # What `compensate` adds is the output itself; every function of the ramp's code is bias_readout_code.
-NOT_DRIVERS = ("time", "output", "segment", "run", "position", "feedback_ramp", "rate_estimated", "rate_estimated_std")
+NOT_DRIVERS = ("time", "output", *NUMBERED, "feedback_ramp", "rate_estimated", "rate_estimated_std")
 
 
 def is_no_driver(name: str) -> bool:

@@ -10,6 +10,7 @@ from math import comb
 
 import numpy as np
 
+from gyromodel._checks import NUMBERED
 from gyromodel.estimate import Estimate
 from gyromodel.signals import Record
 from gyromodel.units import factor
@@ -43,7 +44,7 @@ def _stretches(record: Record) -> np.ndarray:
     """Each row's stretch of one commanded rate, position, segment and run, counted from 0."""
     rows = slice(record.rows)
     begins = np.array(record.sampling.restart)[rows]
-    for name in record.signals.keys() & {"rate", "segment", "run", "position"}:
+    for name in record.signals.keys() & {"rate", *NUMBERED}:
         begins |= np.diff(np.asarray(record.signals[name])[rows], prepend=np.nan) != 0
     return np.cumsum(begins) - 1
 

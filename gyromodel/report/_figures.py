@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
     from gyromodel.diagnosis._result import Diagnosis
 
+# Patterns of the names of all figures.
+FIGURES = ("measured-simulated-*", "residual-*", "driver")
 _LABELLED = 6
 _MEASURED = "measured − model"
 
@@ -94,10 +96,6 @@ def _figures(diagnosis: Diagnosis) -> Figures:
         [_residual(diagnosis, a, name, a.key in causes) for a, name in zip(drivers, _names(drivers), strict=True)],
         left_out,
     )
-
-
-# Patterns of all their names.
-FIGURES = ("measured-simulated-*", "residual-*", "driver")
 
 
 def _names(drivers: list[Abscissa]) -> list[str]:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from gyromodel._checks import NUMBERED
 from gyromodel.averages import average
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis import added_tests
@@ -22,8 +23,6 @@ from gyromodel.study._known import Known
 from gyromodel.study._mission import with_known_output
 from gyromodel.units import factor, internal_unit
 
-# Columns that number stretches of a campaign.
-NUMBERED = ("segment", "run", "position")
 # The campaign that others are held against, and what an improvement leaves of an error.
 REPEATED, IMPROVED = "Repeat the run.", 0.5
 
