@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gyromodel.diagnosis._forms import addition, not_known
-from gyromodel.diagnosis._ranking import Ranking, is_noise, rank_where_it_matters
 from gyromodel.diagnosis._one_cell import CLEARLY
+from gyromodel.diagnosis._ranking import Ranking, is_noise, rank_where_it_matters
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.effects import Effect
 from gyromodel.estimate import Estimate, EstimateError, fit_record
