@@ -2,7 +2,8 @@
 
     python -m benchmarks.batch_fits
 
-writes benchmarks/results/batch_fits.md; `benchmarks.batch_cost` says how the cost grows, and what it is on a GPU.
+writes benchmarks/results/batch_fits.md; `benchmarks.batch_cost` says how the cost grows, and
+`benchmarks.batch_gpu` what it is on a GPU.
 Campaigns are drawn from the fitted model with white noise; peers are given the model's structured columns as their
 Jacobian, compiled, and parameters scaled by their typical sizes, but for one row of optimistix with the parameters as
 the model holds them. Every measurement runs in a process of its own.
