@@ -32,7 +32,8 @@ from gyromodel.effects.scale import (
 )
 from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureCurve, BiasTemperatureGradient
 from gyromodel.estimate import Calibration, fit
-from gyromodel.model import GyroModel, ModelError, model_from_effects, simulate
+from gyromodel.model import GyroModel, ModelError, model_from_effects
+from gyromodel.simulation import simulate
 
 ROWS = 200
 RARE = 1e-5

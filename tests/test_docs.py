@@ -31,8 +31,8 @@ ROOMS = {
 
 def simulate_demo(folder: Path) -> None:
     """The fiber-optic campaign that `gyromodel demo` writes."""
-    from gyromodel.model import simulate
     from gyromodel.plan import read_plan
+    from gyromodel.simulation import simulate
 
     truth = gyromodel.read_model(PACKAGE / "data" / "fiber_optic_truth.yaml")
     campaign = simulate(truth, read_plan(PACKAGE / "data" / "fiber_optic_plan.yaml"), seed=0)

@@ -24,8 +24,9 @@ from gyromodel.effects.scale import ScaleFactor, ScaleNonlinearity, ScaleSagnacS
 from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureCurve, BiasTemperatureRate
 from gyromodel.estimate import Calibration, fit
 from gyromodel.export import export_calibration
-from gyromodel.model import GyroModel, ModelError, effect_class, make_effect, simulate
+from gyromodel.model import GyroModel, ModelError, effect_class, make_effect
 from gyromodel.signals import read_signals
+from gyromodel.simulation import simulate
 from gyromodel.units import factor, internal_unit
 from tests.test_c_code import CC, STRICT
 

@@ -23,11 +23,12 @@ from gyromodel.effects.drivers import Bias
 from gyromodel.effects.scale import ScaleFactor, ScaleNonlinearity, ScaleTemperature
 from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureRate
 from gyromodel.estimate import Calibration, fit, two_stage
-from gyromodel.model import GyroModel, ModelError, simulate
+from gyromodel.model import GyroModel, ModelError
 from gyromodel.model_files import write_model
 from gyromodel.numerics.uncertain import Uncertain
 from gyromodel.report import plan_sentence
 from gyromodel.signals import read_signals
+from gyromodel.simulation import simulate
 from gyromodel.study import (
     OUTCOMES,
     Instrument,
