@@ -27,6 +27,8 @@ _HEADER = re.compile(r"(.*?)\s*\[([^\[\]]*)\]", re.DOTALL)
 _INTEGER = re.compile(r"[-+]?(?:0|[1-9][0-9]*)")
 _DECIMAL = re.compile(r"[-+]?(?:(?:0|[1-9][0-9]*)(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
 _FIELD = re.compile(r"[-+]?(?:(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|inf|infinity)", re.IGNORECASE)
+# Metadata that name a unit or a day.
+NAMES = ("serial", "date")
 _MISSING = ("", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "null", "NULL")
 
 
@@ -82,7 +84,7 @@ def _read_csv_head(stream: io.BufferedIOBase) -> tuple[dict[str, Any], dict[str,
             continue
         if (key := key.strip()) in metadata:
             raise CampaignError(f"metadata {shown(key)} is given twice, the second time in line {number}")
-        metadata[key] = from_text(value.strip())
+        metadata[key] = metadata_value(key, value.strip())
     raise CampaignError("the file is empty" if not size else "there is no header line 'time [s],...'")
 
 
@@ -197,6 +199,12 @@ def to_text(value: str | int | float) -> str:
         return repr(value)
     plain = value == value.strip() and value and not re.search(r"[\x00-\x1f]", value) and from_text(value) == value
     return value if plain else json.dumps(value, ensure_ascii=False)
+
+
+def metadata_value(key: str, text: str) -> str | int | float:
+    """The value of a metadata text; what names a unit or a day is no number that would be written otherwise."""
+    value = from_text(text)
+    return text if key in NAMES and not isinstance(value, str) and str(value) != text else value
 
 
 def from_text(text: str) -> str | int | float:

@@ -57,12 +57,15 @@ class Place:
             raise self.error("expected one value")
         return str(self.node.value)
 
-    def quantity(self) -> tuple[float, str]:
-        """A quantity "12 deg/h" in internal units, and the unit text it was written in."""
+    def quantity(self, difference: bool = False) -> tuple[float, str]:
+        """A quantity "12 deg/h" in internal units, and the unit text it was written in.
+
+        A `difference` of 1 K is 1 °C.
+        """
         text = self.text()
         try:
             value, unit = quantity(text)
-            if internal_unit(unit) == "degC":
+            if internal_unit(unit) == "degC" and not difference:
                 value = float(to_internal(np.asarray(value), unit))
             elif value:
                 value = _rounded_once(text, factor(unit, internal_unit(unit)))
@@ -72,9 +75,9 @@ class Place:
             raise self.error(f"{text!r} is too large")
         return value, unit
 
-    def number_in(self, *units: str) -> float:
+    def number_in(self, *units: str, difference: bool = False) -> float:
         """A quantity that must convert to one of some units, in internal units."""
-        value, written = self.quantity()
+        value, written = self.quantity(difference)
         if not any(convertible(written, unit) for unit in units):
             expected = " or ".join(unit or "a plain number" for unit in units)
             raise self.error(

@@ -22,7 +22,7 @@ from gyromodel._atomic import replace_folder, sibling
 from gyromodel._checks import CampaignError, check_unit, shown
 from gyromodel._csv import (
     Contents,
-    from_text,
+    metadata_value,
     read_csv,
     read_csv_parts,
     read_headers,
@@ -179,7 +179,9 @@ def _parquet_head(schema: Any) -> tuple[dict[str, str], dict[str, Any]]:
             raise CampaignError(f"column '{name}' holds {kind}, expected numbers")
     texts = {key.decode(): value.decode() for key, value in (schema.metadata or {}).items()}
     # What pandas and Arrow note for themselves is not about the gyro.
-    return units, {key: from_text(text) for key, text in texts.items() if key not in ("pandas", "ARROW:schema")}
+    return units, {
+        key: metadata_value(key, text) for key, text in texts.items() if key not in ("pandas", "ARROW:schema")
+    }
 
 
 @contextmanager

@@ -33,6 +33,8 @@ GAIN_UNITS = ("count/deg", "count/(deg/s)", "bit/deg", "bit/(deg/s)", "V/(deg/s)
 FIT_KEYS = ("degrees_of_freedom", "validity", "data_hash", "covariance")
 # By how much a factor's square may differ from the covariance, of its size.
 SAME_COVARIANCE = 1e-6
+# Parameters that are temperatures; others in degC are differences.
+TEMPERATURES = ("breakpoints",)
 SETTING_UNITS = {"reference": "degC", "full_rate": "deg/s", "lowest": "deg/s", "resistance": "ohm"}
 
 
@@ -192,7 +194,7 @@ def _read_parameter(place: Place, effect: Effect, name: str) -> dict[str, Any]:
         place = inner["value"]
     if np.ndim(getattr(effect, name)) > 0:
         places = place.items(name) if isinstance(place.node, yaml.SequenceNode) else [place]
-        return {name: np.array([p.number_in(effect.declared()[name].unit) for p in places])}
+        return {name: np.array([_number(p, effect, name) for p in places])}
     if effect.site == "gain":
         value = place.number_in(*GAIN_UNITS)
         if value == 0:
@@ -201,7 +203,11 @@ def _read_parameter(place: Place, effect: Effect, name: str) -> dict[str, Any]:
     if isinstance(effect, BiasColumn):
         value, unit = place.quantity()
         return {name: value, "unit": unit or ("1" if value else "")}
-    return {name: place.number_in(effect.declared()[name].unit)}
+    return {name: _number(place, effect, name)}
+
+
+def _number(place: Place, effect: Effect, name: str) -> float:
+    return place.number_in(effect.declared()[name].unit, difference=name not in TEMPERATURES)
 
 
 def _read_setting(place: Place, effect: Effect, name: str) -> Any:

@@ -19,7 +19,7 @@ A column is constant or a list of segments, whose last value stays; any key but 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -37,22 +37,31 @@ _MOST_SAMPLES = 100_000_000
 
 
 class _Loader(yaml.SafeLoader):
-    """Dates stay text, as in all metadata."""
+    """Dates stay text, as in all metadata, and no key is given twice."""
 
     yaml_implicit_resolvers: ClassVar[Any] = {
         first: [(tag, pattern) for tag, pattern in known if tag != "tag:yaml.org,2002:timestamp"]
         for first, known in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
 
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        """As YAML has it, but of a key that is there twice neither counts."""
+        keys = [key.value for key, _ in node.value]
+        if twice := [key for key in keys if keys.count(key) > 1]:
+            raise CampaignError(f"{twice[0]!r} appears twice in what begins in line {node.start_mark.line + 1}")
+        return super().construct_mapping(node, deep)
+
 
 def read_yaml(path: Path) -> Any:
     """A plan's file as it is written, dates as text.
 
     Raises:
-        CampaignError: it is no YAML file.
+        CampaignError: it is no YAML file, or has a key twice.
     """
     try:
         return yaml.load(path.read_text(encoding="utf-8"), _Loader)
+    except CampaignError as error:
+        raise CampaignError(f"{path}: {error}") from None
     except (yaml.YAMLError, ValueError) as error:
         raise CampaignError(f"{path}: is no YAML file: {' '.join(str(error).split())}") from None
 

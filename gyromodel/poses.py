@@ -37,8 +37,11 @@ def static_poses(campaign: Campaign) -> Campaign:
     width = max(round(WINDOW / float(np.median(np.diff(time)))), 2)
     still = np.ones(len(time), bool)
     for name in watched:
-        scatter = _scatter(campaign.columns[name], width)
-        still &= scatter < QUIET * np.quantile(scatter[np.isfinite(scatter)], USUAL)
+        values = campaign.columns[name]
+        scatter, steps = _scatter(values, width), np.diff(np.unique(values[np.isfinite(values)]))
+        # A coarse reading at rest stays as it is, or goes to and fro by one step.
+        least = QUIET * np.quantile(scatter[np.isfinite(scatter)], USUAL)
+        still &= scatter < max(least, steps.min(initial=np.inf))
     # A window that moves tells of motion somewhere in it.
     moving = np.convolve(~still, np.ones(width), "same") > 0.5
     ends = np.flatnonzero(np.diff(np.concatenate([[True], moving, [True]]).astype(int)))

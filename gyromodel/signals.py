@@ -27,6 +27,9 @@ OFF = 1.5
 FINER_FROM = 4096
 # A clock is regular if most steps differ by less than this part of the median one; the others are gaps.
 IRREGULAR, MOST_REGULAR = 0.01, 0.9
+# Bits of counters that start anew. Of the rows with an output, the share that may follow one without where an output
+# counts from the row before.
+COUNTERS, MOST_ALONE = (8, 10, 12, 14, 16, 18, 20, 24, 32), 0.5
 # A column missing in more than this share of the rows is not searched; rows without one of the others are left out.
 MOST_MISSING = 0.2
 
@@ -41,8 +44,8 @@ class Record(NamedTuple):
 
     `output` is a rate-type output (increments divided by their interval, angles differenced), or of a platform the
     angle of its base less that of the table; `rows` is the number of
-    real rows before padding; `interval` the nominal sample interval (s); `units` the file's units by column; `blocks`
-    numbers the stretches that replicate one another.
+    real rows before padding; `interval` the usual time (s) between rows with an output; `units` the file's units by
+    column; `blocks` numbers the stretches that replicate one another.
     """
 
     signals: dict[str, Float[Array, " sample"]]
@@ -116,21 +119,39 @@ def rate_output(campaign: Campaign) -> tuple[np.ndarray, str]:
     kind = campaign.metadata["kind"]
     if kind == "rate":
         return output, unit
+    known = np.isfinite(output)
+    if np.sum(known[1:] & ~known[:-1]) > MOST_ALONE * np.sum(known[1:]):
+        raise CampaignError(
+            f"{campaign.name}: most rows with an output follow one without, and an {kind} counts from the row before: "
+            "leave out the rows between"
+        )
     if kind == "angle":
+        if (turn := _wraps_within(output, unit)) is not None:
+            raise CampaignError(f"{campaign.name}: the angle in 'output' wraps round within {turn}; unwrap it")
         output = np.diff(output, prepend=np.nan)
-        if (
-            unit == "rad"
-            and np.nanmax(np.abs(output), initial=0.0) > np.pi
-            and np.ptp(campaign.si("output")) <= 2 * np.pi
-        ):
-            raise CampaignError(f"{campaign.name}: the angle in 'output' wraps round within one turn; unwrap it")
     interval = np.diff(campaign.si("time"), prepend=np.nan)
     typical = np.median(interval[1:])
     # How long the first increment took is known only from a regular clock.
-    if np.mean(np.abs(interval[1:] - typical) < IRREGULAR * typical) > MOST_REGULAR:
+    if _regular(interval[1:], typical):
         interval[0] = typical
     # What was turned through during a gap is not known: the first increment behind one is missing.
     return np.where(interval > MISSING_STEP * typical, np.nan, output / interval), f"{unit}/s"
+
+
+def _wraps_within(angle: np.ndarray, unit: str) -> str | None:
+    """What an angle starts anew after, in words; None where it does not."""
+    turns = {"one turn": 2 * np.pi} if unit == "rad" else {f"2^{bits} {unit}s": 2.0**bits for bits in COUNTERS}
+    known, jump = angle[np.isfinite(angle)], np.nanmax(np.abs(np.diff(angle)), initial=0.0)
+    reach = np.ptp(known) if len(known) else 0.0
+    words, turn = next(((w, t) for w, t in turns.items() if reach <= t), ("", np.inf))
+    # A counter that starts anew has been through all that it can show.
+    passed = unit == "rad" or reach > 0.9 * turn
+    return words if passed and jump > 0.5 * turn else None
+
+
+def _regular(step: np.ndarray, usual: float) -> bool:
+    """Whether nearly all of some steps are the usual one."""
+    return bool(np.mean(np.abs(step - usual) < IRREGULAR * usual) > MOST_REGULAR)
 
 
 def rate_scale(stated: str, unit: str) -> float:
@@ -208,9 +229,30 @@ def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
         blocks.append(block + (blocks[-1].max() + 1 if blocks else 0))
         schemes.add(scheme)
     signals = {n: np.concatenate(v) for n, v in parts.items()}
+    if len(campaigns) > 1:
+        # White noise is the same in all of them, and its samples scatter less where they are further apart.
+        step = _usual_step(*(signals[n] for n in ("_interval", "_restart", "output")))
+        each = [_own_step(*own) for own in zip(*(parts[n] for n in ("_interval", "_restart", "output")), strict=True)]
+        signals["_white"] = np.repeat([step / (own or step) for own in each], [len(v) for v in parts["output"]])
     units = {"campaign": ""} | {n: campaigns[0].units[n] for n in names}
     record = laid_out(signals, np.concatenate(blocks), " and ".join(sorted(schemes)), unit, units)
     return record._replace(data_hash="+".join(c.digest() for c in campaigns))
+
+
+def _usual_step(interval: np.ndarray, restart: np.ndarray, output: np.ndarray) -> float:
+    """The usual time (s) from one row with an output to the next of its run."""
+    step, known = interval[~restart], np.isfinite(output)
+    if not known.all():
+        time, run, rows = np.cumsum(interval), np.cumsum(restart), np.flatnonzero(known)
+        between = np.diff(time[rows])[np.diff(run[rows]) == 0]
+        step = between if len(between) else step
+    return float(np.median(step))
+
+
+def _own_step(interval: np.ndarray, restart: np.ndarray, output: np.ndarray) -> float | None:
+    """A campaign's sample interval (s); none where its rows have no clock, as the dwells of a test."""
+    usual, known = _usual_step(interval, restart, output), np.flatnonzero(np.isfinite(output))
+    return usual if _regular(np.diff(np.cumsum(interval)[known]), usual) else None
 
 
 def _counted_on(runs: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -349,6 +391,7 @@ def laid_out(
     interval, restart = columns.pop("_interval"), columns.pop("_restart")
     white, start = columns.pop("_white", np.ones(rows)), columns.pop("_start", np.zeros(rows))
     signals = {n: jnp.asarray(np.pad(v, (0, extra), mode="edge")) for n, v in columns.items()}
+    step = _usual_step(interval, restart, output)
     present = np.pad(np.isfinite(output), (0, extra))
     sampling = Sampling(
         jnp.asarray(np.pad(interval, (0, extra))),
@@ -357,4 +400,4 @@ def laid_out(
         jnp.asarray(np.pad(white, (0, extra), constant_values=1.0)),
         jnp.asarray(np.pad(start, (0, extra))),
     )
-    return Record(signals, sampling, rows, float(np.median(interval[~restart])), unit, units, blocks, scheme)
+    return Record(signals, sampling, rows, step, unit, units, blocks, scheme)

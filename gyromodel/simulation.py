@@ -28,6 +28,8 @@ def simulate(model: GyroModel, campaign: Campaign, seed: int = 0) -> Campaign:
     """
     if not campaign.outputs:
         campaign = campaign.with_column("output", np.arange(len(campaign), dtype=float), "deg/s")
+    elif "output" in campaign.columns:  # every row gets one, whatever was missing
+        campaign = campaign.with_column("output", np.arange(len(campaign), dtype=float), campaign.units["output"])
     record = read_signals(campaign)
     unset = [e.label for e in model.effects if not np.isfinite(np.asarray(e.linear())).all()]
     if unset:

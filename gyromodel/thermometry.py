@@ -94,6 +94,8 @@ def fit_thermistor(
         EstimateError: too few points, or they do not determine the coefficients.
     """
     check_resistance(resistance)
+    if not np.isfinite([*np.ravel(resistance), *np.ravel(temperature)]).all():
+        raise EstimateError(f"{name}: a resistance or temperature is missing; leave such points out")
     if not 0 <= continuity < ORDER or (joint is None and continuity):
         raise EstimateError("continuity at the joint is 0, 1, 2 or 3, and needs a joint")
     kelvin = np.asarray(temperature, float) + ZERO_CELSIUS

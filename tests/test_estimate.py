@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import binom, chi2, norm
 
 from gyromodel.campaign import Campaign
 from gyromodel.effects.drivers import Bias, BiasDrift
@@ -280,6 +281,26 @@ def test_campaigns_fitted_together_are_independent_records(rng: np.random.Genera
     alone = fit_record(read_signals(parts[1]), linear_model(), ratios=RATIOS)
     unit, unit_alone = (e.std / np.sqrt(e.white_variance) for e in (estimate, alone))
     assert (unit < unit_alone).all()
+
+
+def test_campaigns_of_unlike_intervals_weigh_by_their_white_noise():
+    """A fast, noisy campaign and a slow one of the same N, both following a column: errors against their intervals."""
+    parts, seeds, true = ((300, 0.01), (600, 1.0)), 40, 3.0 * DEG_H
+    model = model_from_effects(["bias", "bias_supply_voltage"])
+    inside, z = 0, []
+    for seed in np.random.SeedSequence(7).generate_state(seeds):
+        rng, found = np.random.default_rng(seed), []
+        for rows, step in parts:
+            voltage = np.sin(np.linspace(0.0, 20.0, rows))
+            output = true * voltage + DEG_H / np.sqrt(step) * rng.standard_normal(rows)
+            columns = {"time": step * np.arange(rows), "supply_voltage": voltage, "output": output}
+            found.append(Campaign(columns, {"time": "s", "supply_voltage": "V", "output": "rad/s"}, {"kind": "rate"}))
+        estimate = fit_record(read_signals(found), model, ratios=NoiseRatios(jnp.asarray(0.0), jnp.asarray(0.0)))
+        assert float(estimate.model.noise["noise_white"]) == pytest.approx(DEG_H, rel=0.15)
+        z.append((float(estimate.model.vector()[1]) - true) / estimate.std[1])
+        inside += abs(z[-1]) < norm.isf(0.025)
+    assert binom.cdf(inside, seeds, 0.95) > 1e-5
+    assert chi2.cdf(np.sum(np.square(z)), seeds) > 1e-5
 
 
 def test_stated_noise_is_used_as_it_stands(rng: np.random.Generator):

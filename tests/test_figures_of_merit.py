@@ -121,6 +121,14 @@ def test_conditions_that_fail_are_said():
     assert "not white" in walking["ARW"].refused
     assert walking["RWC"].refused
 
+    # The Earth's rate is no bias, and a table that turns is no rest.
+    still = run(white(rng))
+    there = by_symbol(still.with_column("rate", np.full(ROWS, 7.5), "deg/h"))
+    assert there["B0"].published == pytest.approx(by_symbol(still)["B0"].published - 7.5)
+    assert there["B0"].published == pytest.approx(there["B0"].modern, abs=5 * there["B0"].modern_std)
+    turned = by_symbol(still.with_column("rate", np.linspace(0.0, 1.0, ROWS), "deg/s"))
+    assert all("reference rate changed by 1 deg/s" in turned[symbol].refused for symbol in ("B0", "Bs", "ARW", "RWC"))
+
     # A line whose period is eight samples: means over whole periods lose it, which no power of τ does.
     line = by_symbol(run(white(rng) + 0.5 * np.sin(2 * np.pi * np.arange(ROWS) / 8 + 0.3)))
     assert "not of the form" in line["RWC"].refused

@@ -67,6 +67,18 @@ def test_metadata_values(tmp_path: Path, text: str, value: Any):
 
 
 @pytest.mark.parametrize(
+    ("text", "value"), [("1.10", "1.10"), ("12E4", "12E4"), ("1.1", 1.1), ("12", 12), ('"12"', "12"), ("007", "007")]
+)
+def test_serials_stay_as_they_are_written(tmp_path: Path, text: str, value: Any):
+    campaign = read_text(tmp_path, f"# serial: {text}\n{LINES}")
+    for name in ("b.csv", "b.parquet"):
+        write_campaign(campaign, tmp_path / name)
+        again = read_campaign(tmp_path / name).metadata["serial"]
+        assert campaign.metadata["serial"] == again == value
+        assert type(again) is type(value)
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", "the file is empty"),

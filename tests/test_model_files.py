@@ -542,6 +542,17 @@ def test_absolute_zero_and_fahrenheit_references(tmp_path: Path):
     assert float(effect.coefficient) == pytest.approx(1.8 * DEG_H)
 
 
+def test_differences_of_temperature_are_none_from_absolute_zero(tmp_path: Path):
+    text = "{effect: thermometer_error, bias: [3 deg/h/degC], error: 0.1 K, reference: 298.15 K, resistance: 10 kohm}"
+    error = read(tmp_path, entry(text)).effects[1]
+    assert float(error.error) == pytest.approx(0.1)
+    assert float(error.reference) == pytest.approx(25.0)
+    hysteresis = read(tmp_path, entry("{effect: bias_thermal_hysteresis, half_width: 3.6 degF}")).effects[1]
+    assert float(hysteresis.half_width) == pytest.approx(2.0)
+    hinge = "{effect: bias_temperature_curve, hinges: [1 deg/h/K], breakpoints: [300 K]}"
+    assert float(read(tmp_path, entry(hinge)).effects[1].breakpoints[0]) == pytest.approx(26.85)
+
+
 def test_a_line_beside_the_curve_that_holds_it_is_left_to_the_curve(tmp_path: Path) -> None:
     path = tmp_path / "model.yaml"
     path.write_text("effects: [{effect: bias}, {effect: bias_temperature}, {effect: bias_temperature_curve}]")

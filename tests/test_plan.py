@@ -80,6 +80,11 @@ def test_mistakes_are_named_where_they_are(tmp_path: Path, columns: str, expecte
     assert expected in str(caught.value)
 
 
+def test_no_key_is_given_twice(tmp_path: Path):
+    with pytest.raises(CampaignError, match=r"plan\.yaml: 'rate' appears twice in what begins in line 7"):
+        planned(tmp_path, "  rate: 5 deg/s\n  rate: 0 deg/s\n")
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [

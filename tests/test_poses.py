@@ -47,6 +47,17 @@ def test_poses_are_those_that_were_held():
     assert len(kept) > (truth > 0).sum() - 20 * 1.2 / STEP
 
 
+@pytest.mark.parametrize("step", [0.04, 0.1, 0.4])
+def test_coarse_readings_are_at_rest_as_well(step: float, rng: np.random.Generator):
+    """Steps of 4 to 40 mg for a noise of 2: readings that do not move, or go to and fro."""
+    campaign, truth = turned(rng, 12)
+    columns = {n: v if n in ("time", "output") else step * np.round(v / step) for n, v in campaign.columns.items()}
+    columns["acceleration_z"] = np.full(len(truth), step)
+    found = at_rest(Campaign(columns, campaign.units, campaign.metadata))
+    kept = np.searchsorted(campaign.columns["time"], found.columns["time"])
+    assert np.array_equal(found.columns["position"], truth[kept])
+
+
 def test_hand_turned_poses_of_a_measured_unit(measured_data):
     """Its authors turned it 37 times after a still start."""
     found = at_rest(read_campaign(measured_data("mems_multiposition_a/campaign.csv.gz")))

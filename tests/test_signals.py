@@ -3,6 +3,8 @@ one rate output whatever the campaign recorded."""
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -155,6 +157,42 @@ def test_what_was_turned_through_in_a_gap_is_missing(kind: str, rng: np.random.G
     lost[0] = kind == "angle"
     assert np.array_equal(np.isnan(found), lost)
     assert found[~lost] == pytest.approx(np.deg2rad(rate[keep] / 3600)[~lost])
+
+
+@pytest.mark.parametrize(("unit", "turn", "words"), [("deg", 360.0, "one turn"), ("count", 65536.0, "2^16 counts")])
+def test_an_angle_that_starts_anew_is_refused(unit: str, turn: float, words: str):
+    """Also where samples are missing; an angle that only happens to reach as far is none that wraps."""
+    time, angle = np.arange(ROWS) * STEP, turn / 60 * np.arange(ROWS)
+    known = np.arange(ROWS) != 100
+    wrapped = np.where(known, angle % turn, np.nan)
+    with pytest.raises(CampaignError, match=re.escape(f"wraps round within {words}; unwrap it")):
+        read_signals(campaign(time, wrapped, unit, "angle"))
+    swung = 0.499 * turn * (1 + np.sin(angle / turn))
+    for whole in (np.where(known, angle, np.nan), np.where(known, swung, np.nan)):
+        assert read_signals(campaign(time, whole, unit, "angle")).present.sum() == ROWS - 3
+
+
+@pytest.mark.parametrize("kind", ["increment", "angle"])
+def test_increments_in_some_rows_only_count_from_none(kind: str, rng: np.random.Generator):
+    output = np.where(np.arange(ROWS) % 4 == 0, rng.standard_normal(ROWS), np.nan)
+    with pytest.raises(CampaignError, match=f"an {kind} counts from the row before: leave out the rows between"):
+        read_signals(campaign(np.arange(ROWS) * STEP, output, "arcsec", kind))
+
+
+@pytest.mark.parametrize("every", [1, 4, 10])
+def test_the_interval_is_that_of_rows_with_an_output(every: int, rng: np.random.Generator):
+    output = np.where(np.arange(ROWS) % every == 0, rng.standard_normal(ROWS), np.nan)
+    output[50:60] = np.nan
+    assert read_signals(campaign(np.arange(ROWS) * STEP, output)).interval == pytest.approx(every * STEP)
+
+
+def test_white_noise_of_campaigns_goes_by_their_intervals(rng: np.random.Generator):
+    """N is the unit's: samples a hundredth as long scatter by ten times as much; dwells have no clock."""
+    fast, slow = (campaign(np.arange(n) * s, rng.standard_normal(n)) for n, s in ((300, 0.01), (200, 1.0)))
+    dwells = campaign(np.cumsum(rng.uniform(0.5, 1.5, 50)), rng.standard_normal(50))
+    record = read_signals([fast, slow, dwells])
+    white = np.asarray(record.sampling.white)[: record.rows]
+    assert record.interval / white == pytest.approx(np.repeat([0.01, 1.0, record.interval], [300, 200, 50]))
 
 
 def test_missing_outputs_are_not_present(rng: np.random.Generator):

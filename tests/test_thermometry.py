@@ -120,4 +120,6 @@ def test_errors():
         fit_thermistor(r, t, continuity=1)
     with pytest.raises(EstimateError, match="needs 5 points or more for its own terms and their scatter"):
         fit_thermistor(r[:4], t[:4])
+    with pytest.raises(EstimateError, match="a resistance or temperature is missing"):
+        fit_thermistor(np.append(np.nan, r[1:]), t)
     assert np.isnan(BROKEN.temperature(np.array([np.nan, 1e4]))).tolist() == [True, False]

@@ -27,6 +27,7 @@ from gyromodel.figures_of_merit._published import (
 )
 from gyromodel.model import GyroModel
 from gyromodel.noise import deviation, with_gaps
+from gyromodel.noise_analysis import AT_REST
 from gyromodel.numerics.state_space import colour
 from gyromodel.signals import Record, rate_scale, read_signals
 from gyromodel.units import UnitError, factor, internal_unit
@@ -131,12 +132,19 @@ class _Run:
         plain = fit_record(record, model, ratios=estimate.ratios, ordinary=True)
         rate = np.where(record.present, np.asarray(record.signals["output"])[: record.rows], np.nan)
         temperature, unsteady = np.nan, ""
+        if "rate" in record.signals:
+            turning = np.asarray(record.signals["rate"])[: record.rows][record.present]
+            turned = np.rad2deg(np.ptp(turning))
+            rate = rate - turning.mean()
+            if not turned <= AT_REST:
+                changed = f"changed by {turned:.3g} deg/s" if np.isfinite(turned) else "is not known"
+                unsteady = f"the reference rate {changed} during the run; hold the gyro still"
         if "temperature" in record.signals:
             values = np.asarray(record.signals["temperature"])[: record.rows]
             temperature = float(np.nanmean(values)) if np.isfinite(values).any() else np.nan
             tenths = [part[np.isfinite(part)] for part in np.array_split(values, 10)]
             moved = float(np.ptp([part.mean() for part in tenths if len(part)] or [0.0]))
-            if moved > STEADY:
+            if moved > STEADY and not unsteady:
                 unsteady = f"the temperature moved by {moved:.1f} °C during the run; hold it within {STEADY:g} °C"
         # The first row of angles has no rate: only what is missing between the first and the last one is a gap.
         ends = np.flatnonzero(record.present)[[0, -1]]
