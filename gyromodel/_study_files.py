@@ -31,6 +31,7 @@ def run_sensitivity(
     errors = read_instruments(design, other) if design and other else {}
     # What a wrong file says comes before the work.
     parts = read_candidates(candidates) if candidates else []
+    own = read_instruments(candidates, parts[0].campaign) if candidates else {}
     try:
         budget = seconds(time) if parts else 0.0
     except (CampaignError, UnitError) as error:
@@ -47,7 +48,7 @@ def run_sensitivity(
     jacobian = leading.jacobian.reshape(-1, len(gyros.vector))
     choice = best_plan(
         gyros, parts, budget, criterion, jacobian=jacobian, rivals=rivals,
-        instruments=instruments if other is None else errors,
+        instruments=own or (instruments if other is None else errors),
     )  # fmt: skip
     plain = {"criterion": choice.criterion, "gain": choice.gain}
     if criterion == "outcome":

@@ -59,6 +59,10 @@ def sensitivity(
     """Tell what a calibration's errors do to a mission, where they come from, and what to measure next."""
     if (candidates is None) != (budget is None):
         raise typer.BadParameter("a test plan needs both --candidates and --budget", param_hint="--budget")
+    if candidates is None and (criterion or rival):
+        raise typer.BadParameter(
+            "is for a test plan, which needs --candidates", param_hint="--rival" if rival else "--criterion"
+        )
     from gyromodel._study_files import print_sensitivity, run_sensitivity
 
     criterion = criterion or ("discrimination" if rival else "outcome" if outcome else "parameters")

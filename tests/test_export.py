@@ -20,6 +20,8 @@ from gyromodel.campaign import Campaign
 from gyromodel.compensation import compensate
 from gyromodel.effects import CATALOGUE, Effect, Signals
 from gyromodel.effects.drivers import Bias, BiasColumn, BiasStep
+from gyromodel.effects.memory import BiasThermalHysteresis
+from gyromodel.effects.power_cycles import BiasTurnOn
 from gyromodel.effects.scale import ScaleFactor, ScaleNonlinearity, ScaleSagnacSine, ScaleSpline
 from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureCurve, BiasTemperatureRate
 from gyromodel.estimate import Calibration, fit
@@ -336,9 +338,18 @@ def test_px4_of_a_bias_alone_holds_everywhere():
     }
 
 
+def test_px4_takes_a_scale_factor_that_is_known_to_be_one():
+    text = export_calibration(Calibration(GyroModel((ScaleFactor(value=1.0, unit="1"), Bias(value=2e-3)))), "px4", "z")
+    assert params(text)["TC_G0_X0_2"] == pytest.approx(2e-3, rel=1e-7)
+
+
 @pytest.mark.parametrize(
-    "more", [SCALE, BiasTemperatureRate(coefficient=jnp.asarray(1e-3)), ScaleNonlinearity(full_rate=jnp.ones(()))]
-)
+    "more",
+    [
+        SCALE, BiasTemperatureRate(coefficient=jnp.asarray(1e-3)), ScaleNonlinearity(full_rate=jnp.ones(())),
+        BiasStep(size=1e-3, epoch=5.0), BiasTurnOn(offsets=[5e-3], runs=[2.0]), BiasThermalHysteresis(),
+    ],
+)  # fmt: skip
 def test_what_px4_has_no_parameter_for_is_refused(more: Effect):
     with pytest.raises(ModelError, match=f"PX4 has no parameter for (a gyro's )?{more.label}"):
         export_calibration(thermal(more), "px4", "x")

@@ -34,6 +34,8 @@ from gyromodel.study import (
     Instrument,
     Outcome,
     Part,
+    _mission,
+    _next,
     best_plan,
     covariance_after,
     information,
@@ -43,6 +45,8 @@ from gyromodel.study import (
     sobol_indices,
     symmetric_factor,
 )
+from gyromodel.study._known import models_at
+from gyromodel.study._mission import read_mission
 from gyromodel.study._next import slower
 
 DEG_H = np.pi / 180 / 3600
@@ -117,6 +121,14 @@ def test_noise_and_instruments_have_closed_forms():
     assert rate.instruments["temperature"] == pytest.approx(0.1 * np.hypot(0.5, 0.2))
 
 
+@pytest.fixture
+def averaged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Missions and tests above 20 000 rows are averaged."""
+    for room in (_mission, _next):
+        monkeypatch.setattr(room, "LONGEST", 20_000)
+
+
+@pytest.mark.usefixtures("averaged")
 def test_a_long_mission_has_the_noise_and_the_errors_of_its_samples():
     """The same ramp at a hundred times the rate, which is averaged: a rate's noise is that of one sample."""
     rows = 100 * ROWS + 100
@@ -131,8 +143,24 @@ def test_a_long_mission_has_the_noise_and_the_errors_of_its_samples():
     assert rate.instruments["temperature"] == pytest.approx(0.1 * 0.5)
     assert np.deg2rad(angle.noise["noise_white"]) == pytest.approx(WHITE * np.sqrt(t), rel=1e-3)
     assert angle.instruments["temperature"] == pytest.approx(0.1 / 3600 * t * 0.5 / np.sqrt(rows), rel=1e-3)
+    assert "averaged by 2 samples" in found.warnings[0]
 
 
+@pytest.mark.parametrize("rows", [20_000, 20_001, 50_000])
+def test_a_rate_that_alternates_keeps_the_error_of_a_scale_factor(rows: int):
+    """100 ppm of 10 deg/s, whichever way the gyro turns."""
+    rate = np.where(np.arange(rows) % 2, 10.0, -10.0)
+    units = {"time": "s", "rate": "deg/s", "output": "deg/s"}
+    turned = Campaign({"time": 1.0 * np.arange(rows), "rate": rate, "output": rate}, units, {"kind": "rate"})
+    model = GyroModel((ScaleFactor(value=1.0, unit="1"),), {"noise_white": WHITE})
+    flown, _ = read_mission(turned, (model,))
+    errors = flown.errors(models_at((model,), jnp.array([1.0 + 1e-4])))
+    assert np.abs(errors[0, :rows]) == pytest.approx(np.deg2rad(1e-3), rel=1e-3)
+    told = information(model, turned)
+    assert told == pytest.approx(np.array([[rows * np.deg2rad(10.0) ** 2 / WHITE**2]]))
+
+
+@pytest.mark.usefixtures("averaged")
 def test_what_a_long_test_tells_counts_each_sample():
     """Of errors that each sample has by itself, a test of twice the samples tells twice as much, averaged or not."""
     model, errors = GyroModel(THERMAL, WHITE_ALONE), {"temperature": Instrument(0.0, 50.0)}
@@ -298,6 +326,24 @@ def test_what_a_test_tells_is_that_of_the_dense_covariance():
     assert after == pytest.approx(np.linalg.inv(np.linalg.inv(COVARIANCE) + told), rel=1e-6)
 
 
+def test_a_table_that_errs_by_a_part_of_its_rate_errs_both_ways():
+    """Its error is one of the scale factor, in rates of either sign, and none of the bias."""
+    rate = np.where(np.arange(ROWS) % 2, 100.0, -100.0)
+    campaign, model = mission().with_column("rate", rate, "deg/s"), GyroModel(LINE, {"noise_white": WHITE})
+    told = information(model, campaign, {"rate": Instrument(common_part=1e-3)})
+    std = np.sqrt(np.diag(np.linalg.inv(told)))
+    noise = WHITE / np.sqrt(STEP * ROWS)
+    assert std[0] == pytest.approx(np.hypot(1e-3, noise / np.deg2rad(100.0)), rel=1e-6)
+    assert std[1] == pytest.approx(noise, rel=1e-6)
+    # Of a mission that turns as far back as forth nothing is left of the angle, whatever the thermometer's share.
+    swing = mission(temperature=np.where(np.arange(ROWS) % 2, 5.0, -5.0))
+    part = {"temperature": Instrument(common_part=0.1)}
+    found = sensitivity(thermal(COVARIANCE, WHITE_ALONE), swing, ["angle", "rate"], instruments=part)
+    angle, each = (result.budget for result in found.results)
+    assert angle.instruments["temperature"] < 1e-6
+    assert each.instruments["temperature"] == pytest.approx(0.1 * 0.5)
+
+
 def test_the_next_test_halves_the_variance_of_the_last():
     """After a campaign of white noise alone, the same again."""
     j, campaign = np.column_stack([np.ones(ROWS), RAMP - 20.0]), mission(temperature=RAMP)
@@ -415,6 +461,20 @@ def test_a_plan_beside_one_that_tells_nothing_apart_has_no_ratio():
     assert choice.gain == np.inf
     said = plan_sentence(choice, "angle")
     assert f"lie {choice.best.separation:.3g} standard deviations apart; each part in turn does not" in said
+
+
+def test_an_instrument_s_error_is_one_in_all_parts():
+    """A table that errs by 1 deg/h leaves that of the bias, however often a part is repeated."""
+    calibration = known(Calibration(gyro((Bias(),)), np.eye(1)))
+    errors = {"rate": Instrument(common=DEG_H)}
+    for budget in (60.0, 6000.0):
+        choice = best_plan(calibration, levels([0, 1]), budget, instruments=errors)
+        noise = WHITE / np.sqrt(budget)
+        assert choice.best.covariance[0, 0] == pytest.approx(DEG_H**2 + noise**2, rel=1e-4)
+    # Of three gyros on one table each has it.
+    three = known([Calibration(gyro((Bias(),)), np.eye(1))] * 3)
+    choice = best_plan(three, levels([0, 1]), 6000.0, instruments=errors)
+    assert np.diag(choice.best.covariance) == pytest.approx(np.full(3, DEG_H**2 + WHITE**2 / 6000.0), rel=1e-4)
 
 
 def test_a_changeover_takes_its_time_with_each_part(tmp_path: Path):
@@ -560,6 +620,7 @@ def test_a_test_plan_is_best_for_what_was_asked(files: Path, capsys: pytest.Capt
         ("model", None, ["--outcome", "speed"], "no outcome is called speed"),
         ("model", None, ["--candidates", "PLAN", "--budget", "1 h"], "list of candidates"),
         ("model", None, ["--candidates", "C", "--budget", "1 s"], "fits into"),
+        ("model", None, ["--candidates", "OTHER", "--budget", "4 h"], "instruments names nonsense"),
     ],
 )
 def test_a_study_that_cannot_be_says_why(
@@ -567,9 +628,9 @@ def test_a_study_that_cannot_be_says_why(
     capsys: pytest.CaptureFixture[str],
 ):  # fmt: skip
     (files / "bent.yaml").write_text(PLAN.replace(*change) if change else PLAN, encoding="utf-8")
-    more = [
-        str(files / {"PLAN": "plan.yaml", "C": "candidates.yaml"}.get(x, x)) if x in ("PLAN", "C") else x for x in more
-    ]
+    (files / "other.yaml").write_text("instruments: {nonsense: 1 degC}\n" + CANDIDATES, encoding="utf-8")
+    named = {"PLAN": "plan.yaml", "C": "candidates.yaml", "OTHER": "other.yaml"}
+    more = [str(files / named[x]) if x in named else x for x in more]
     more = more if "--outcome" in more else [*more, "--outcome", "angle"]
     assert run(files / f"{model}.yaml", "--plan", files / "bent.yaml", *more, "-o", files / "none") == 1
     assert not (files / "none").exists()
@@ -583,6 +644,12 @@ def test_a_budget_without_a_unit_is_wrong_usage(files: Path, capsys: pytest.Capt
     common = [files / "model.yaml", "--plan", files / "plan.yaml", "--candidates", files / "candidates.yaml"]
     assert run(*common, "--budget", "4") == 2
     assert "Invalid value for --budget: expected a time above zero" in capsys.readouterr().err
+
+
+def test_what_is_for_a_test_plan_needs_candidates(files: Path, capsys: pytest.CaptureFixture[str]):
+    for option in (["--rival", "bias_drift"], ["--criterion", "parameters"]):
+        assert run(files / "model.yaml", "--plan", files / "plan.yaml", *option) == 2
+        assert f"{option[0]}: is for a test plan, which needs --candidates" in capsys.readouterr().err
 
 
 def test_outcomes_that_no_error_reaches_have_an_empty_figure(files: Path, capsys: pytest.CaptureFixture[str]):

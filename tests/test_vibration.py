@@ -13,6 +13,7 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import binom, chi2
 
 from gyromodel.platform import SineFit, fit_sines, published_response
+from gyromodel.platform._responses import _published
 
 # One shape for all fits: samples of a record, records at once, drift and sines fitted.
 SAMPLES, DRAWS, DEGREE, HARMONICS = 128, 1200, 1, 2
@@ -165,3 +166,13 @@ def test_published_phase_near_zero(rng: np.random.Generator):
             # 1 − cos φ is normal with the variance of Σ(x − y)²/(2n) over A²/2: E√|z| = Γ(3/4) 2^¼/√π of its root.
             spread = np.sqrt(2 * 2 * noise**4 / samples * 2)
             assert np.nanmean(taken) == pytest.approx(np.rad2deg(np.sqrt(2 * spread) * 0.8222), rel=0.1)
+
+
+@pytest.mark.parametrize("periods", [1, 2, 3])
+def test_the_published_estimator_takes_every_whole_period(periods: int):
+    """Its last sample is one step before the end of a period."""
+    time = 0.01 * np.arange(100 * periods)
+    table, base = np.sin(2 * np.pi * time), 0.9 * np.sin(2 * np.pi * time - 0.3)
+    gain, phase = _published(time, base, table, 2 * np.pi)
+    assert gain == pytest.approx(20 * np.log10(0.9), abs=1e-6)
+    assert phase == pytest.approx(np.rad2deg(0.3), abs=1e-6)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial
 
 from gyromodel import __version__
+from gyromodel.effects import Effect
 from gyromodel.estimate import Calibration
 from gyromodel.model import ModelError
 from gyromodel.units import convertible
@@ -41,9 +42,9 @@ def as_px4(calibration: Calibration, axis: str, number: int = 0) -> str:
             unit = getattr(effect, "unit", "")
             if not convertible(unit or "1", "1") or float(effect.value) != 1.0:  # type: ignore[attr-defined]
                 raise ModelError(f"PX4 has no parameter for a gyro's {effect.label}: fit the rates it already scales")
-        elif effect.site != "rate" or not np.isfinite(effect.contribution(_of_temperature(np.zeros(3)))).all():
+        elif not _follows_temperature(effect):
             raise ModelError(f"PX4 has no parameter for {effect.label}: its offset is a cubic of temperature alone")
-    thermal = any(effect.columns_needed for effect in model.effects)
+    thermal = any("temperature" in effect.columns_needed for effect in model.effects)
     if thermal and "temperature" not in calibration.validity:
         raise ModelError("the model does not say for which temperatures it holds: fit it")
     # A bias alone holds at any temperature.
@@ -72,6 +73,13 @@ def as_px4(calibration: Calibration, axis: str, number: int = 0) -> str:
     shown = (str(int(x)) if kind == INTEGER else f"{np.float32(x):.9g}" for _, x, kind in values)
     lines += [f"1\t1\t{name}\t{text}\t{kind}" for (name, _, kind), text in zip(values, shown, strict=True)]
     return "\n".join(lines) + "\n"
+
+
+def _follows_temperature(effect: Effect) -> bool:
+    """Whether a bias follows the temperature of the moment and nothing else, nor time."""
+    alone = set(effect.columns_needed) <= {"temperature"} and not (effect.remembers or effect.scan)
+    finite = effect.site == "rate" and np.isfinite(effect.contribution(_of_temperature(np.zeros(3)))).all()
+    return bool(alone and finite)
 
 
 def _of_temperature(values: np.ndarray) -> dict[str, jax.Array]:

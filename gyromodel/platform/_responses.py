@@ -340,7 +340,8 @@ def _rounding(amplitude: float, quantum: float, noise: float) -> float:
 
 def _published(time: np.ndarray, x: np.ndarray, y: np.ndarray, w: float) -> tuple[float, float]:
     """Equations (8)-(29) over the whole periods there are, means taken off."""
-    whole = 2 * np.pi / w * np.floor(w * time[-1] / (2 * np.pi) + 1e-9)
+    step = np.median(np.diff(time))
+    whole = 2 * np.pi / w * np.floor(w * (time[-1] + step) / (2 * np.pi) + 1e-9)
     inside = time < whole - 1e-9
     base, table = (jnp.asarray(s[inside] - s[inside].mean()) for s in (x, y))
     found = published_response(base, table)

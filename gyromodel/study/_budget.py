@@ -196,8 +196,9 @@ def _of_errors(
     added: dict[str, float] = {}
     if outcome.samples:
         for name, change in changes.items():
-            common, independent = instruments[name].sizes(np.asarray(mission.signals[name]))
-            square = (change**2 * (common**2 + independent**2))[:, np.asarray(mission.duration) > 0].ravel()[at]
+            values = np.asarray(mission.signals[name])
+            size = (instruments[name].all_along(values) ** 2).sum(axis=0) + instruments[name].of_each(values) ** 2
+            square = (change**2 * size)[:, np.asarray(mission.duration) > 0].ravel()[at]
             added[name] = float(np.sqrt(square.mean()))
         kinds = _each_axis(mission, record, None)
         if kinds is None:
@@ -206,10 +207,11 @@ def _of_errors(
         return {k: float(np.sqrt(v)) for k, v in zip(kinds[0], each, strict=True) if v > 0}, added
     rows = responses(outcome, mission)
     for name, change in changes.items():
-        common, independent = instruments[name].sizes(np.asarray(mission.signals[name]))
+        values = np.asarray(mission.signals[name])
         # All axes read one thermometer.
-        together = np.einsum("eas,as->e", rows, change * common) ** 2
-        each = (np.einsum("eas,as->es", rows, change * independent) ** 2).sum(axis=1) / mission.together
+        together = (np.einsum("eas,as,ks->ke", rows, change, instruments[name].all_along(values)) ** 2).sum(axis=0)
+        own = change * instruments[name].of_each(values)
+        each = (np.einsum("eas,as->es", rows, own) ** 2).sum(axis=1) / mission.together
         added[name] = float(np.sqrt((together + each).mean()))
     kinds = _each_axis(mission, record, rows)
     if kinds is None:

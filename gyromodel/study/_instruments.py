@@ -33,12 +33,14 @@ class Instrument(NamedTuple):
     common_part: float = 0.0
     independent_part: float = 0.0
 
-    def sizes(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The errors of some values of the column."""
-        return (
-            np.hypot(self.common, self.common_part * values),
-            np.hypot(self.independent, self.independent_part * values),
-        )
+    def all_along(self, values: np.ndarray) -> np.ndarray:
+        """What each error that is one all along makes of some values of the column: a part of it has their sign."""
+        both = (self.common, np.full(len(values), self.common)), (self.common_part, self.common_part * values)
+        return np.array([error for size, error in both if size]).reshape(-1, len(values))
+
+    def of_each(self, values: np.ndarray) -> np.ndarray:
+        """Standard errors that each of some values has for itself."""
+        return np.hypot(self.independent, self.independent_part * values)
 
     def improved(self, part: float) -> Instrument:
         """The same with a part of its errors."""

@@ -23,6 +23,8 @@ from gyromodel.signals import Record, read_signals
 
 # Outcomes that are told where none is named, if a mission has them.
 USUAL = ("rate", "angle", "peak", "bias_temperature", "attitude", "position")
+# Longer missions and tests are averaged to so many rows.
+LONGEST = 200_000
 # Temperatures (°C) at which the bias is taken for its temperature sensitivity, apart by so much, and the room's.
 TEMPERATURE_STEP, ROOM = 1.0, 25.0
 
@@ -209,7 +211,7 @@ def read_mission(campaign: Campaign, models: tuple[GyroModel, ...]) -> tuple[Mis
     Raises:
         ModelError: a model needs a column that the mission lacks, or that is of another unit.
     """
-    averaged, together = average(with_known_output(campaign))
+    averaged, together = average(with_known_output(campaign), LONGEST)
     record = read_signals(averaged)
     models = tuple(model.prepared(record.signals) for model in models)
     for model in models:

@@ -20,7 +20,7 @@ from gyromodel.signals import OFF, read_signals, with_columns_known
 from gyromodel.study._budget import Budget
 from gyromodel.study._instruments import Instrument, output_by_column
 from gyromodel.study._known import Known
-from gyromodel.study._mission import with_known_output
+from gyromodel.study._mission import LONGEST, with_known_output
 from gyromodel.units import factor, internal_unit
 
 # The campaign that others are held against, and what an improvement leaves of an error.
@@ -47,6 +47,8 @@ def information(
     instruments: Mapping[str, Instrument] | None = None,
     noise: float = 1.0,
     rivals: Sequence[Effect] = (),
+    *,
+    shared: bool = False,
 ) -> Float[np.ndarray, "parameter parameter"]:
     """Jᵀ V⁻¹ J of a planned campaign: what it says of the model's free parameters, internal units.
 
@@ -58,13 +60,15 @@ def information(
         instruments: errors of columns.
         noise: times the model's noise.
         rivals: effects whose linear coefficients follow on the model's parameters, were they added.
+        shared: whether the instruments' errors of a whole campaign, in standard errors, are further parameters, as
+            where they are those of other campaigns too: see `without_shared`.
 
     Raises:
         ModelError: the model states no noise, or needs a column that is not there.
     """
     if not model.noise:
         raise ModelError("what a test can tell depends on the noise: state noise_white and the rest in the model")
-    averaged, together = average(with_known_output(campaign))
+    averaged, together = average(with_known_output(campaign), LONGEST)
     record = with_columns_known(read_signals(averaged))[0]
     model = model.prepared(record.signals)
     check_covariates(record, model)
@@ -77,20 +81,36 @@ def information(
     for name, instrument in (instruments or {}).items():
         if name in signals:
             change = output_by_column(model, signals, name) / std
-            all_along, own = instrument.sizes(np.asarray(signals[name]))
-            common.append(change * all_along)
-            white += (change * own) ** 2 / together
+            values = np.asarray(signals[name])
+            common += [change * error for error in instrument.all_along(values)]
+            white += (change * instrument.of_each(values)) ** 2 / together
     record = record._replace(sampling=record.sampling._replace(white=jnp.asarray(white)))
     added = [np.asarray(model.columns_of(effect, signals)) for effect in rivals]
     jacobian = np.column_stack([np.asarray(model.linearise(signals)[1]), *added]) / std
     columns = np.column_stack([jacobian, *common])
     padded = jnp.asarray(np.pad(columns, ((0, 0), (0, -columns.shape[1] % 16))))
     whitened = np.asarray(whiten_columns(filter_of(record, ratios), padded))[record.present.nonzero()[0]]
-    j, c = np.split(whitened[:, : columns.shape[1]], [jacobian.shape[1]], axis=1)
     if not np.isfinite(whitened).all():
         raise ModelError(f"the model has no finite derivative by its parameters on {campaign.name}")
-    cross = c.T @ j
-    return j.T @ j - cross.T @ np.linalg.solve(np.eye(len(common)) + c.T @ c, cross)
+    j, c = np.split(whitened[:, : columns.shape[1]], [jacobian.shape[1]], axis=1)
+    if not shared:
+        # As `without_shared`, by orthogonal steps: little may be left of much.
+        prior = np.eye(len(common), len(common) + j.shape[1])
+        left = np.asarray(np.linalg.qr(np.concatenate([np.column_stack([c, j]), prior]), mode="r"))[len(common) :]
+        return left[:, len(common) :].T @ left[:, len(common) :]
+    seen = np.column_stack([j, c])
+    return seen.T @ seen
+
+
+def without_shared(told: np.ndarray, count: int) -> np.ndarray:
+    """Information, or a stack of it, less its last so many parameters, of each of which a standard error of 1 is known.
+
+    Information adds up before these are left out, where they are the same in all of it.
+    """
+    if not count:
+        return told
+    cross, own = told[..., -count:, :-count], told[..., -count:, -count:] + np.eye(count)
+    return told[..., :-count, :-count] - np.swapaxes(cross, -1, -2) @ np.linalg.solve(own, cross)
 
 
 def covariance_after(

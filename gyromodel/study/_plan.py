@@ -1,6 +1,7 @@
 """The best test plan for a time: how often to do each of some candidate parts, by exchange (Fedorov, 1972).
 
-Parts are measured one after another with noise that starts anew in each, so that what they tell adds up.
+Parts are measured one after another with noise that starts anew in each, so that what they tell adds up; an error that
+an instrument has all along is one in all of them.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from gyromodel.plan import planned, read_yaml
 from gyromodel.signals import read_signals
 from gyromodel.study._known import Known
 from gyromodel.study._mission import with_known_output
-from gyromodel.study._next import blocks, covariance_after, information
+from gyromodel.study._next import blocks, covariance_after, information, without_shared
 from gyromodel.units import UnitError, convertible, factor, internal_unit, quantity
 
 Criterion = Literal["parameters", "outcome", "discrimination"]
@@ -176,25 +177,25 @@ def best_plan(
     joint = read_signals([with_known_output(part.campaign, i) for i, part in enumerate(parts)])
     models = tuple(model.prepared(joint.signals) for model in known.models)
     effects = GyroModel(tuple(map(make_effect, rivals))).prepared(joint.signals).effects
-    told = np.stack([
-        blocks([information(m, part.campaign, instruments, rivals=effects) for m in models]) for part in parts
-    ])  # fmt: skip
+    each = [[information(m, p.campaign, instruments, rivals=effects, shared=True) for m in models] for p in parts]
+    kinds = sum(len(e.all_along(np.zeros(1))) for name, e in (instruments or {}).items() if name in joint.signals)
+    shared, told = kinds * len(models), np.stack([_shared_last(of_part, kinds) for of_part in each])
     count = len(known.vector)
     errors = known.factor
     if anew:
-        most = told[:, :count, :count].sum(axis=0).diagonal()
+        most = without_shared(told.sum(axis=0), shared)[:count, :count].diagonal()
         if not (most > 0).all():
             raise ModelError("the candidates together tell nothing of a parameter of the model: add another part")
         errors = np.diag(VAGUE / np.sqrt(most))
-    score = _score(criterion, errors, jacobian, effects)
+    score = _score(criterion, errors, jacobian, effects, shared)
     start = _in_turn(durations, budget)
     found = [_exchanged(n, told, durations, budget, score) for n in (np.zeros(len(parts), int), start)]
     best = max(found, key=lambda n: score(np.tensordot(n, told, 1)[None])[0])
-    separation = _score("discrimination", errors, None, effects) if rivals else None
+    separation = _score("discrimination", errors, None, effects, shared) if rivals else None
 
     def plan(n: np.ndarray) -> TestPlan:
         total = np.tensordot(n, told, 1)
-        covariance = covariance_after(errors, total[:count, :count])
+        covariance = covariance_after(errors, without_shared(total, shared)[:count, :count])
         apart = float(np.exp(separation(total[None])[0] / 2)) if separation else np.nan
         times = {part.name: int(k) for part, k in zip(parts, n, strict=True) if k}
         return TestPlan(times, float(n @ durations), covariance, apart)
@@ -211,7 +212,23 @@ def best_plan(
     return PlanChoice(criterion, plan(best), plan(start), float(gain))
 
 
+def _shared_last(told: Sequence[np.ndarray], kinds: int) -> np.ndarray:
+    """Information of several gyros, their instruments' errors behind all parameters."""
+    ends = np.cumsum([0, *map(len, told)])
+    shared = np.concatenate([np.arange(end - kinds, end) for end in ends[1:]]) if kinds else np.zeros(0, int)
+    order = np.append(np.setdiff1d(np.arange(ends[-1]), shared), shared)
+    return blocks(told)[np.ix_(order, order)]
+
+
 def _score(
+    criterion: Criterion, errors: np.ndarray, jacobian: np.ndarray | None, effects: Sequence[Effect], shared: int
+) -> Callable[[np.ndarray], np.ndarray]:
+    """A score of stacks of information matrices whose last parameters are shared errors, the larger the better."""
+    score = _score_alone(criterion, errors, jacobian, effects)
+    return lambda told: score(without_shared(told, shared))
+
+
+def _score_alone(
     criterion: Criterion, errors: np.ndarray, jacobian: np.ndarray | None, effects: Sequence[Effect]
 ) -> Callable[[np.ndarray], np.ndarray]:
     """A score of stacks of information matrices, the larger the better."""

@@ -161,6 +161,11 @@ def sensitivity(
         results.append(Result(found, drawn, indices(outcome, which, flown, base, seed) if wanted else ()))
         pairs.append((which, found))
     warnings = _outside(gyros, single, record.rows)
+    if single.together > 1:
+        warnings.append(
+            f"The mission was averaged by {single.together:g} samples: of errors that change sign within so many, as "
+            "those of a scale factor do with the rate, only the means count."
+        )
     tests: tuple[NextTest, ...] = ()
     if all(model.noise for model in gyros.models):
         errors = instruments if design is None else dict(design_instruments or {})
