@@ -28,12 +28,14 @@ from gyromodel.batch._references import referred
 from gyromodel.batch._results import SCHEMA, Results
 from gyromodel.campaign import Campaign
 from gyromodel.estimate import fit
-from gyromodel.files import write_campaign
+from gyromodel.files import read_campaign, write_campaign
 from gyromodel.model_files import read_model
+from gyromodel.platform import fit_vibration
 
 MODEL = "effects: [{effect: bias}, {effect: bias_temperature}]\n"
 # Of two lengths, so that few shapes are compiled.
 LENGTHS = (60, 64)
+PLATFORM = Path(cli.__file__).parent / "data" / "platform_vibration.csv.gz"
 
 
 def campaign(k: int, **metadata: str) -> Campaign:
@@ -663,3 +665,37 @@ def test_what_a_diagnosis_adds_is_of_one_temperature_too(tmp_path: Path):
     assert {s.parameter: s.campaigns for s in unit_statistics(done.table)}["bias.value"] == 3
     kept = done.table.set_column(done.table.column_names.index("reason"), "reason", pa.array(["own"] * len(rows)))
     assert unit_statistics(kept) == []
+
+
+@pytest.mark.parametrize("outputs", [True, False])
+def test_a_vibration_test_of_a_platform_is_fitted_as_one(tmp_path: Path, outputs: bool):
+    """Not as three gyros, where it has the rates of the platform as well."""
+    log = read_campaign(PLATFORM)
+    for name in log.outputs if not outputs else ():
+        log = log.without(name)
+    (tmp_path / "model.yaml").write_text("effects: [{effect: sync_delay}]\n")
+    (tmp_path / "archive").mkdir()
+    write_campaign(log, tmp_path / "archive" / "log.csv")
+    rows = here(tmp_path).table.to_pylist()
+    estimate = fit_vibration([log], read_model(tmp_path / "model.yaml"))
+    assert {(row["axis"], row["status"]) for row in rows} == {(None, "fitted")}
+    values = {row["parameter"]: row["value"] for row in rows}
+    assert values["sync_delay.delay"] == pytest.approx({r.name: r.value for r in estimate.table()}["delay"])
+
+
+def test_parameters_of_unlike_structure_do_not_mix(tmp_path: Path):
+    """An axis that leans towards one that turns in some campaigns, and another one in others."""
+    (tmp_path / "model.yaml").write_text("effects: [{effect: bias}, {effect: misalignment}]\n" + STATED.split("\n")[1])
+    (tmp_path / "archive").mkdir()
+    units = {"time": "s", "rate": "deg/s", "rate_spin": "deg/s", "rate_output": "deg/s", "output": "deg/s"}
+    for k, (about, lean) in enumerate([("rate_spin", 1e-3), ("rate_output", -2e-3)] * 2):
+        time, turn = np.arange(200.0), np.where(np.arange(200) % 20 < 10, 20.0, -20.0)
+        columns = {"time": time, "rate": 0 * time, "rate_spin": 0 * time, "rate_output": 0 * time, about: turn}
+        output = lean * turn + 1e-5 * np.random.default_rng(k).standard_normal(200)
+        measured = Campaign(columns | {"output": output}, units, {"kind": "rate", "serial": "U1"})
+        write_campaign(measured, tmp_path / "archive" / f"c{k}.csv")
+    found = {each.parameter: each.mean for each in unit_statistics(here(tmp_path).table)}
+    arcsec = 3600 * np.rad2deg(1e-3)
+    assert found["misalignment.angles[about rate_spin]"] == pytest.approx(arcsec, rel=1e-3)
+    assert found["misalignment.angles[about rate_output]"] == pytest.approx(-2 * arcsec, rel=1e-3)
+    assert "misalignment.angles" not in found

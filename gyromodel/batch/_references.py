@@ -17,6 +17,7 @@ from gyromodel.estimate import Estimate, read_for_fit
 from gyromodel.files import read_campaign
 from gyromodel.model import GyroModel
 from gyromodel.model_files import SETTING_UNITS, setting_unit
+from gyromodel.platform import is_platform
 
 # Values in internal units, and as texts, by effect and setting, such as bias_temperature.reference.
 References = dict[str, tuple[float, str]]
@@ -39,6 +40,8 @@ def open_references(every: Sequence[Entry], model: GyroModel, diagnosing: bool) 
     for entry in every if unset or diagnosing else ():
         try:
             campaign = read_campaign(entry.path)
+            if is_platform(campaign):
+                continue
             if len(campaign.outputs) > 1:
                 campaign = campaign.axis(campaign.outputs[0].removeprefix("output_"))
             record = read_for_fit([campaign])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,9 +16,11 @@ from gyromodel.batch._archive import Entry
 from gyromodel.batch._references import References, referred
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis import diagnose
+from gyromodel.effects import Effect
 from gyromodel.estimate import EstimateError, calibration_of, fit, fit_many, noise_table, read_for_fit
 from gyromodel.files import read_campaign
 from gyromodel.model import GyroModel, ModelError
+from gyromodel.platform import fit_vibration, is_platform
 from gyromodel.signals import Record
 from gyromodel.units import UnitError
 
@@ -26,6 +29,8 @@ Row = dict[str, Any]
 REFUSALS = (CampaignError, EstimateError, ModelError, UnitError)
 # Why parameters do not compare with those of other campaigns.
 OWN = "told at reference points of this campaign's own"
+# Settings of effects that are told elsewhere: in names and units, or by the campaign itself.
+ELSEWHERE = ("unit", "column", "campaign", "campaigns")
 # Rows beyond which a campaign is fitted by itself: those fitted together are held in memory side by side.
 LONGEST = 1 << 16
 
@@ -66,7 +71,7 @@ def read(lot: Lot) -> list[Ready]:
             continue
         head["data_hash"] = campaign.digest()
         head |= {key: str(campaign.metadata[key]) for key in ("serial", "date") if key in campaign.metadata}
-        if campaign.outputs in ((), ("output",)):
+        if is_platform(campaign) or campaign.outputs in ((), ("output",)):
             found.append(_ready(head, campaign, lot))
             continue
         for axis in (name.removeprefix("output_") for name in campaign.outputs):
@@ -79,7 +84,7 @@ def read(lot: Lot) -> list[Ready]:
 
 def _ready(head: Row, campaign: Campaign, lot: Lot) -> Ready:
     """Noise that is not stated takes nearly all of a fit's time, and is found one campaign at a time anyway."""
-    if lot.diagnosing or not lot.model.noise or len(campaign) > LONGEST:
+    if lot.diagnosing or not lot.model.noise or len(campaign) > LONGEST or is_platform(campaign):
         return Ready(head, campaign, None)
     try:
         return Ready(head, campaign, read_for_fit([campaign]))
@@ -137,7 +142,7 @@ def _rows(one: Ready, lot: Lot) -> list[Row]:
                 "reason": None if common else OWN,
             }
         else:
-            estimate = fit(campaign, lot.model)
+            estimate = fit_vibration([campaign], lot.model) if is_platform(campaign) else fit(campaign, lot.model)
             model, covariance = estimate.model, estimate.covariance
             head = head | {"status": "fitted"}
         return _parameters(head, estimate.record, model, covariance, estimate.iterations, estimate.noise_interval)
@@ -149,14 +154,29 @@ def _parameters(
     head: Row, record: Record, model: GyroModel, covariance: np.ndarray, iterations: int, noise: Any = None
 ) -> list[Row]:
     head = head | {"samples": int(record.present.sum()), "iterations": iterations}
+    of = {effect.label: _structure(effect) for effect in model.effects}
     rows = [
-        head | {"parameter": f"{r.effect}.{r.name}", "value": float(r.value), "std": float(r.std), "unit": r.unit}
+        head
+        | {
+            "parameter": f"{r.effect}.{r.name}{of[r.effect]}",
+            "value": float(r.value),
+            "std": float(r.std),
+            "unit": r.unit,
+        }
         for r in calibration_of(model, covariance, record, 0).table()
     ]
     for name, found in noise_table(model, noise or {}).items():
         ends = {"low": _known(found["lo"]), "high": _known(found["hi"])}
         rows.append(head | {"parameter": name, "value": float(found["value"]), "unit": str(found["unit"])} | ends)
     return rows
+
+
+def _structure(effect: Effect) -> str:
+    """What an effect's parameters are of, where that is not the usual: those of another structure do not compare."""
+    chosen = [f for f in fields(effect) if f.metadata.get("static") and f.name not in ELSEWHERE]
+    own = [(f.name, getattr(effect, f.name)) for f in chosen if getattr(effect, f.name) != f.default]
+    texts = (f"{name} {' '.join(map(str, v)) if isinstance(v, tuple) else v}" for name, v in own)
+    return f"[{', '.join(texts)}]" if own else ""
 
 
 def failed(head: Row, error: Exception) -> Row:
