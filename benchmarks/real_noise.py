@@ -34,6 +34,7 @@ LOGS = {
 # Logs that hold lines, of the dither and of the feedback ramp (docs/cases), which a diagnosis is to find as well.
 WITH_LINES = ("rlg", "fog")
 TURNED = "turned "
+HEAD = ["log", "design", "hidden", "size", "said"]
 TIMES = (None, 1.0, 3.0, 10.0)
 
 
@@ -141,13 +142,13 @@ def main(argv: list[str] | None = None) -> None:
         "a closed-loop fiber-optic gyro for 180 s), averaged to the rows of three simulated designs",
         "(`tests/truth/designs.py`), each also with its sign turned. Effects are drawn from those that a design can",
         "show and slow noise does not imitate; their sizes are multiples of what is detectable in the noise that is",
-        "fitted to the series. Lines that the ring laser's dither and the fiber-optic gyro's feedback leave in their",
-        "logs are no part of what is judged here (`docs/cases`): they are named, and rightly. One log in three designs",
-        "is not three logs: the 95 % intervals are too narrow.",
+        "fitted to the series. Lines of the ring laser's dither and of the fiber-optic gyro's feedback are in their",
+        "logs: naming them, or telling of them, is not judged here (`docs/cases`). One log in three designs is not",
+        "three logs: the 95 % intervals are too narrow.",
         "",
         *table(["measure", "campaigns"], rows),
         "",
-        *(["What was wrong:", "", *table(["log", "design", "hidden", "size", "said"], wrong)] if wrong else []),
+        *(["Found with nothing hidden, or firm and wrong:", "", *table(HEAD, wrong)] if wrong else []),
     ]
     write_result("real_noise", "Effects in the noise of real gyros", "real_noise", argv, lines)
 

@@ -201,7 +201,10 @@ def export(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="File to write; printed without.")
     ] = None,
-    axis: Axis = None,
+    axis: Annotated[
+        Literal["x", "y", "z"] | None,
+        typer.Option("--axis", help="Axis of the autopilot, with --to px4 only.", show_default=False),
+    ] = None,
 ) -> None:
     """Write a calibration for firmware and spreadsheets; to PX4, that of one axis."""
     if (to == "px4") != (axis is not None):

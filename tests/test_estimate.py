@@ -497,3 +497,13 @@ def test_campaigns_of_one_padded_length_share_their_programs(rng: np.random.Gene
     for rows in (250, 240, 256):
         simulate_and_fit(rows)
     assert len(compilations) == before
+
+
+@pytest.mark.parametrize("rows", [20, 100])
+def test_colour_that_so_few_samples_cannot_show_has_no_upper_end(rows: int, rng: np.random.Generator):
+    time = STEP * np.arange(rows)
+    columns = {"time": time, "output": DEG_H * rng.standard_normal(rows)}
+    found = fit(Campaign(columns, {"time": "s", "output": "rad/s"}, {"kind": "rate"}), model_from_effects(["bias"]))
+    ends = [found.noise_table()[name]["hi"] for name in ("noise_flicker", "noise_random_walk")]
+    assert np.isfinite(ends).all() == (rows > 40)
+    assert np.isfinite(found.noise_table()["noise_white"]["hi"])

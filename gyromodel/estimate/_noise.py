@@ -100,7 +100,8 @@ def settled(a: NoiseRatios, b: NoiseRatios) -> bool:
 def with_noise_intervals(estimate: Estimate) -> Estimate:
     """The estimate with 95 % intervals of its noise coefficients, where the noise was estimated.
 
-    They are the coefficients' ranges over the noise cells that a likelihood ratio does not reject.
+    They are the coefficients' ranges over the noise cells that a likelihood ratio does not reject; of colour that so
+    few samples cannot show they have no end.
     """
     if estimate.noise_given:
         return estimate
@@ -135,6 +136,9 @@ def with_noise_intervals(estimate: Estimate) -> Estimate:
     low, high = spans["noise_white"]
     scatter = 1.96 / float(np.sqrt(2 * (record.present.sum() - 1)))
     spans["noise_white"] = (low * (1 - scatter), high * (1 + scatter))
+    if len(grid.flicker) == 1:
+        # So few samples show no colour: there may be any amount of it.
+        spans |= {name: (0.0, np.inf) for name in spans if name != "noise_white"}
     return replace(estimate, noise_interval=spans)
 
 

@@ -258,7 +258,7 @@ def _noise(noise: Mapping[str, Mapping[str, float | str]], of: str) -> list[dict
     rows = []
     for name, entry in noise.items():
         value, low, high = (float(entry.get(key, math.nan)) for key in ("value", "lo", "hi"))
-        interval = f"{number(low, 3)} to {number(high, 3)}" if math.isfinite(low) or math.isfinite(high) else "–"
+        interval = f"{number(low, 3)} to {number(high, 3)}" if math.isfinite(high) else "too few samples to tell"
         unit = unit_text(str(entry.get("unit", "")))
         rows.append(
             {"title": title(name, of), "id": name, "value": number(value, 3), "interval": interval, "unit": unit}
@@ -369,5 +369,5 @@ def _small(p: float) -> str:
 
 def _separation(value: float) -> str:
     """A separation in words."""
-    bounds = ((0.05, "cannot be told apart"), (0.3, "hardly told apart"), (0.7, "partly alike"))
+    bounds = ((0.05, "shares a column"), (0.3, "nearly shares a column"), (0.7, "partly alike"))
     return next((word for bound, word in bounds if value < bound), "clearly different")

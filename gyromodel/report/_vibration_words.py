@@ -79,7 +79,8 @@ def vibration_sentence(test: VibrationTest) -> str:
 def notes(test: VibrationTest) -> list[str]:
     """How to read the numbers of the runs."""
     return [
-        "± are 95 % intervals in noise of the colour that each run shows; a negative phase is late.",
+        "± are 95 % intervals in noise of the colour that each run shows, in what explains the runs standard "
+        "uncertainties; a negative phase is late.",
         "arccos is the published estimator: without sign, and the noise makes it larger.",
         "Limits are those published for 1, 10, 20 and 30 rad/s; at other frequencies there are none.",
     ]

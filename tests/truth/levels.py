@@ -296,7 +296,7 @@ def amplitude_levels(records: list[Record]) -> list[Level]:
 def adequacy_level(records: list[Record]) -> Level:
     """Row 17: the extended model lacks nothing."""
     after = [r.answer.adequate_after for r in records if r.answer]
-    measure = "extended model is adequate, named or ambiguous, 3×"
+    measure = "extended model, diagnosed again, is adequate, of those named or ambiguous, 3×"
     return _level("17", measure, "–", 0.95, True, [a for a in after if a is not None])
 
 
