@@ -40,7 +40,7 @@ def average(campaign: Campaign, maximum: int = MAXIMUM_ROWS, seconds: float = 0.
     if together == 1:
         return campaign, 1
     if campaign.metadata["kind"] != "rate":
-        campaign = _as_rate(campaign)
+        campaign = as_rate(campaign)
     step = np.diff(time)
     breaks = np.concatenate([[False], step > GAP * np.median(step)])
     for name in NUMBERED:
@@ -80,7 +80,10 @@ def turning(campaign: Campaign, together: int) -> list[str]:
     return found
 
 
-def _as_rate(campaign: Campaign) -> Campaign:
+def as_rate(campaign: Campaign) -> Campaign:
+    """The campaign with its output as a rate, whatever it recorded."""
+    if campaign.metadata["kind"] == "rate":
+        return campaign
     output, _ = rate_output(campaign)
     unit = f"{campaign.units['output']}/s"
     return Campaign(

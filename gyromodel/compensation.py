@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy import stats
 
-from gyromodel._checks import thermometers
+from gyromodel._checks import listed, thermometers
 from gyromodel.attitude import with_reference_rates
 from gyromodel.averages import MEAN_OF_ATTITUDE, average
 from gyromodel.campaign import Campaign
 from gyromodel.effects import Signals
-from gyromodel.effects.power_cycles import BiasTurnOn
+from gyromodel.effects.power_cycles import BiasTurnOn, cycles
 from gyromodel.estimate import Calibration, check_covariates, validity_unit
 from gyromodel.model import GyroModel, ModelError, check_domain, check_units
 from gyromodel.signals import Record, rate_output, read_signals
@@ -156,7 +156,7 @@ def _estimate(calibration: Calibration, record: Record) -> tuple[np.ndarray, np.
     """Rate and its variance, of real rows; the variance is NaN where neither covariance nor noise is known."""
     model, covariance = calibration.model, calibration.covariance
     needed = {name for effect in model.effects for name in effect.columns_needed}
-    names = {"time", "time_on", "rate", *needed, *(f"{name}_rate" for name in thermometers(needed))}
+    names = {"time", "time_on", "rate", "campaign", *needed, *(f"{name}_rate" for name in thermometers(needed))}
     signals = {name: values for name, values in record.signals.items() if name in names}
     output = jnp.where(record.sampling.present, record.signals["output"], jnp.nan)
     white = jnp.asarray(model.noise.get("noise_white", 0.0)) ** 2 / record.interval
@@ -179,7 +179,7 @@ def _counts(calibration: Calibration, record: Record, rate: np.ndarray, std: np.
         counts[name] += int((present & ((values < low - margin) | (values > high + margin))).sum())
     for i, effect in enumerate(calibration.model.effects):
         if isinstance(effect, BiasTurnOn):
-            run = np.asarray(record.signals["run"])[: record.rows]
+            run = np.asarray(cycles(record.signals))[: record.rows]
             counts[f"run {i}"] += int((present & ~np.isin(run, np.asarray(effect.runs))).sum())
     return counts
 
@@ -205,6 +205,14 @@ def told(calibration: Calibration, campaign: Campaign, counts: Counter[str]) -> 
             notes.append(
                 f"{other} of {present} samples are of other runs than {known} and take the first run's bias: "
                 "what turn-ons differ by is not in rate_estimated_std."
+            )
+    for effect in model.effects:
+        numbers = {*getattr(effect, "campaigns", ()), getattr(effect, "campaign", 0)} - {0}
+        here = {*np.unique(campaign.columns["campaign"])} if "campaign" in campaign.columns else {1}
+        if numbers - here:
+            others = listed(sorted(map(str, numbers - here)))
+            notes.append(
+                f"{effect.label} was in campaign {others} of those that were fitted, and is not in these data."
             )
     if timed := [e.label for e in model.effects if "time" in e.columns_needed]:
         notes.append(f"Time in {', '.join(dict.fromkeys(timed))} counts from the start of this campaign.")

@@ -362,20 +362,29 @@ def with_columns_known(record: Record) -> tuple[Record, list[str]]:
     A column missing in more than a fifth of the rows is left as it is: it costs more than it can tell.
     """
     signals, said = dict(record.signals), []
-    present, row = record.present, np.arange(len(signals["time"]))
-    for name in [n for n in signals if n != "output"]:
-        values = np.array(signals[name])
-        bad = ~np.isfinite(values)
+    present = record.present
+    missing = {n: bad for n, v in signals.items() if n != "output" and (bad := ~np.isfinite(np.asarray(v))).any()}
+    for name, bad in missing.items():
         lost = int((bad[: record.rows] & present).sum())
-        if not bad.any() or lost > MOST_MISSING * present.sum():
+        if lost > MOST_MISSING * present.sum():
             continue
-        # Rows that are left out still need a finite value, which then has no weight.
-        values[bad] = np.interp(row[bad], row[~bad], values[~bad])
-        signals[name] = jnp.asarray(values)
         record = record.without(np.flatnonzero(bad[: record.rows]))
         if lost and name in record.units:
             said.append(f"{lost} rows without {name} were left out.")
+    for name, bad in missing.items():
+        # Rows that are left out still need a finite value, which then has no weight.
+        if not (bad[: record.rows] & record.present).any() and not bad.all():
+            signals[name] = jnp.asarray(_filled(np.array(signals[name]), bad, name in NUMBERED))
     return record._replace(signals=signals), said
+
+
+def _filled(values: np.ndarray, bad: np.ndarray, numbers: bool) -> np.ndarray:
+    """Values with those that are bad between their neighbours, or, of numbers of stretches, the nearest one's."""
+    row, known = np.arange(len(values)), np.flatnonzero(~bad)
+    at = np.interp(row[bad], known, np.arange(len(known)))
+    good = values[known]
+    values[bad] = good[np.rint(at).astype(int)] if numbers else np.interp(at, np.arange(len(known)), good)
+    return values
 
 
 def laid_out(

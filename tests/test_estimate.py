@@ -427,11 +427,7 @@ def test_a_far_start_ends_at_the_warm_up_or_is_refused(start: float, rng: np.ran
     output = 3.0 * np.exp(-time / 3600.0) + 0.05 * rng.standard_normal(len(time))
     log = Campaign({"time": time, "output": output}, {"time": "s", "output": "deg/h"}, {"kind": "rate"})
     model = GyroModel((BiasWarmup(time_constant=jnp.asarray(start)),), {"noise_white": 0.05 * DEG_H * np.sqrt(60.0)})
-    try:
-        found = fit(log, model)
-    except EstimateError:
-        return
-    assert found.table()[1].value == pytest.approx(3600.0, abs=100.0)
+    assert fit(log, model).table()[1].value == pytest.approx(3600.0, abs=100.0)
 
 
 def test_too_few_samples_are_refused(rng: np.random.Generator):

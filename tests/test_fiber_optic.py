@@ -139,6 +139,6 @@ def test_the_default_simulation_is_the_published_output_model(tmp_path: Path):
     scale = 1 + 30e-6 * (rate / 100) ** 2 + 5e-6 * (temperature - 25)
     expected = 328.95 * (rate + (environment + 5) / 3600) * scale
     predicted = np.asarray(model.prepared(read_signals(log).signals).predict(read_signals(log).signals))[: len(log)]
-    assert predicted == pytest.approx(expected, rel=1e-3, abs=1e-3)
+    assert predicted == pytest.approx(expected, rel=1e-6, abs=1e-3)
     noise = log.columns["output"] - predicted
     assert noise[:60].std() == pytest.approx(328.95 * 0.018 / 60 / np.sqrt(10), rel=0.5)

@@ -84,9 +84,10 @@ class Parameter(NamedTuple):
         """What stands out."""
         name = f"{self.parameter} {self.axis}".strip()
         for o in self.outliers:
+            rare = float(f"{0.5 / stats.norm.sf(abs(o.deviations)):.2g}")
             yield (
-                f"Unit {o.unit} stands out: its {name} is {o.value:.4g} {self.unit}, {o.deviations:+.1f} standard "
-                f"deviations from what the others lead to expect, ({o.expected:.4g} ± {o.std:.2g}) {self.unit}."
+                f"Unit {o.unit} stands out: its {name} is {o.value:.4g} {self.unit}, where the others lead to expect "
+                f"({o.expected:.4g} ± {o.std:.2g}) {self.unit}; of such units one in {rare:,.0f} would be as far off."
             )
         for d in self.drifts:
             yield f"Unit {d.unit} drifts: its {name} changes by ({d.rate:.3g} ± {d.std:.2g}) {self.unit} per {d.per}."

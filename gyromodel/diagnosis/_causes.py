@@ -33,6 +33,7 @@ def cause_of(
     trials: int,
     null_scores: np.ndarray,
     least: float,
+    stated: dict[str, float],
 ) -> Cause:
     """A step of the search as a cause: sizes with their uncertainties, probabilities, and what it may be taken for."""
     name = step.name
@@ -69,17 +70,25 @@ def cause_of(
             own = float(log_evidence_ratio(np.array(explained), result.rss, nu, 1))
             price = float(np.clip(own - statistic, min(scanner.bank.price(name), 0.0), np.log(shapes)))
             part = least_told(statistic, least, price, nu)
-            parameters = tuple(_told(p, step.effect, part) for p in parameters)
+            continues = name in ranking.tangents
+            parameters = tuple(_told(p, step.effect, part, continues, stated.get(p.name)) for p in parameters)
         if isinstance(step.effect, BiasStep):
             parameters = tuple(_dated(scanner, estimate, turn, g, p) for p in parameters)
     return Cause(name, parameters, statistic, p, adjusted, members.get(name, 0.0), confusers, step.points)
 
 
-def _told(parameter: ParameterValue, effect: Effect | None, part: float) -> ParameterValue:
-    """The one coefficient of an effect with its interval, if at `part` of its size it would not have been told."""
-    if effect is None or parameter.name != effect.leading() or not parameter.std > 0.0:
+def _told(
+    parameter: ParameterValue, effect: Effect | None, part: float, continues: bool, stated: float | None
+) -> ParameterValue:
+    """The one size of an effect with its interval, if at `part` of it it would not have been told.
+
+    Of an effect that continues others it is its amplitude; `stated` is what a fixed one was in the simulation.
+    """
+    if effect is None or not parameter.std > 0.0:
         return parameter
-    nothing = 1.0 if effect.site == "gain" else 0.0
+    if parameter.name != (effect.amplitude_name() if continues else effect.leading()):
+        return parameter
+    nothing = stated if stated is not None else 1.0 if effect.site == "gain" else 0.0
     z = (parameter.value - nothing) / parameter.std
     low, high = (nothing + parameter.std * end for end in after_selection(z, part * abs(z)))
     return replace(parameter, ci95=(low, high))

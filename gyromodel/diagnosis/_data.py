@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
 
 from gyromodel._checks import CampaignError
 from gyromodel.attitude import refuse_navigated, with_reference_rates
-from gyromodel.averages import MEAN_OF_ATTITUDE, MOST_TURN, average, turning
+from gyromodel.averages import MEAN_OF_ATTITUDE, MOST_TURN, as_rate, average, turning
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._variance import steps_of_output, stretch_still, thermometers_still
 from gyromodel.platform import is_platform, vibration_record
@@ -85,6 +86,7 @@ def _of_gyro(measured: Sequence[Campaign]) -> Data:
     ]
     if any(m > 1 for _, m in shortened):
         most = max(m for _, m in shortened)
+        shortened = [(as_rate(c), m) for c, m in shortened]
         findings.append(
             f"Means of {most} consecutive samples were searched: lines above their sample rate and quantisation are "
             "averaged away."
@@ -100,12 +102,33 @@ def _of_gyro(measured: Sequence[Campaign]) -> Data:
     findings += [line for c in given for line in thermometers_still(c)]
     searched = tuple(c for c, _ in shortened)
     record = read_signals(searched)
+    if any(m > 1 for _, m in shortened):
+        record = _of_means(record, campaigns, searched)
+    if "run" in searched[0].columns and "run" not in as_given[0].columns:
+        # Nothing tells that the gyro was off between the stretches.
+        since = float(searched[0].metadata.get("time_since_power_on", 0.0))
+        record = record._replace(signals=record.signals | {"time_on": record.signals["time"] + since})
     output_unit = campaigns[0].units["output"]
     if campaigns[0].metadata["kind"] != "rate":
         output_unit = f"{output_unit}/s"
     whole = searched[0] if len(searched) == 1 else _together(searched)
-    rows_of = tuple((c, c is m) for c, m in zip(searched, measured, strict=True))
+    rows_of = tuple((c, len(c) == len(m)) for c, m in zip(searched, measured, strict=True))
     return Data(record, searched, rows_of, whole, tuple(findings), _rate_unit(campaigns[0]), output_unit)
+
+
+def _of_means(record: Record, campaigns: Sequence[Campaign], means: Sequence[Campaign]) -> Record:
+    """The record of means, in time since the first samples; of each how many samples it is of, and how far apart.
+
+    The means of a line are smaller than it by as much as its phase turns within them (`BiasPeriodic`).
+    """
+    steps = [float(np.median(np.diff(c.si("time")))) for c in campaigns]
+    late = [float(m.si("time")[0] - c.si("time")[0]) for c, m in zip(campaigns, means, strict=True)]
+    counts = [max(round(float(np.median(np.diff(m.si("time")))) / s), 1) for m, s in zip(means, steps, strict=True)]
+    rows, extra = [len(m) for m in means], len(record.sampling.present) - record.rows
+    by_row = (np.pad(np.repeat(each, rows), (0, extra), mode="edge") for each in (late, counts, steps))
+    offset, averaged, step = map(jnp.asarray, by_row)
+    moved = {name: record.signals[name] + offset for name in ("time", "time_on")}
+    return record._replace(signals=record.signals | moved | {"_averaged": averaged, "_step": step})
 
 
 def _with_runs(campaign: Campaign) -> Campaign:

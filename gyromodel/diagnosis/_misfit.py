@@ -27,6 +27,8 @@ NEAR = 1.5
 NARROWEST, EXCESS = 8, 1.25
 # Spreads beyond which a sample is a tail: two such side by side would make a band by themselves.
 TAIL = 4.0
+# Runs whose intervals differ by more than this ratio have no frequencies in common.
+UNLIKE = 1.1
 
 
 def unexplained_axes(estimate: Estimate) -> list[str]:
@@ -97,9 +99,16 @@ def unsteady_lines(estimate: Estimate) -> list[bool]:
 def excess_band(estimate: Estimate) -> str:
     """A sentence where some band of frequencies has more power than the fitted noise gives it; empty where none has.
 
+    Nothing is said of runs of unlike intervals, which have no frequencies in common.
     Bands are halves, quarters and so on of all frequencies, overlapping by half; their number is paid for.
     """
-    residual = estimate.whitened[estimate.record.present]
+    record = estimate.record
+    time, run = np.asarray(record.signals["time"])[: record.rows], record.run[: record.rows]
+    each = [np.diff(time[run == k]) for k in np.unique(run)]
+    steps = [np.median(step) for step in each if len(step) >= NARROWEST]
+    if steps and max(steps) > UNLIKE * min(steps):
+        return ""
+    residual = estimate.whitened[record.present]
     most = TAIL * float(np.median(np.abs(residual))) / norm.isf(0.25)
     residual = np.clip(residual, -most, most)
     count = (len(residual) - 1) // 2
@@ -114,7 +123,7 @@ def excess_band(estimate: Estimate) -> str:
     seldom, ratio, *ends = min(bands)
     if seldom * len(bands) > SELDOM or ratio < EXCESS:
         return ""
-    low, high = (k / (len(residual) * estimate.record.interval) for k in ends)
+    low, high = (k / (len(residual) * record.interval) for k in ends)
     return (
         f"Noise of the fitted kinds does not explain what is left from {low:.3g} to {high:.3g} Hz, with {ratio:.2g} "
         "times the power of the rest: something oscillates there that is no steady line, or it is noise of another "

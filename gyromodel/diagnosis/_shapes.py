@@ -39,16 +39,19 @@ def remaining(scanner: Scanner, baseline: Estimate, selection: Selection) -> tup
         predicted, jacobian = estimate.model.linearise(record.signals)
         gain = float(estimate.model.gain())
         y = np.where(scanner.present, np.asarray(record.signals["output"]) - predicted, 0.0) / gain
-        marks = np.zeros((len(scanner.present), 0))
-        rows = [r for f in selection.found for r in f.rows]
-        if rows:
-            marks = np.zeros((len(scanner.present), len(rows)))
-            marks[rows, np.arange(len(rows))] = 1.0
-        w = scanner.cells.whiten(g, np.column_stack([jacobian, marks, y]))
+        w = scanner.cells.whiten(g, np.column_stack([jacobian, _given_up(scanner, selection), y]))
         base = w[:, :-1] / np.maximum(np.linalg.norm(w[:, :-1], axis=0), 1e-300)
         residuals.append(float(np.sum((w[:, -1] - base @ np.linalg.lstsq(base, w[:, -1], rcond=1e-10)[0]) ** 2)))
     named = max(residuals[0] - residuals[1], 0.0)
     return driver, left / (left + named)
+
+
+def _given_up(scanner: Scanner, selection: Selection) -> np.ndarray:
+    """A column for each row that was given up: one there, zero elsewhere."""
+    rows = [r for f in selection.found for r in f.rows]
+    marks = np.zeros((len(scanner.present), len(rows)))
+    marks[rows, np.arange(len(rows))] = 1.0
+    return marks
 
 
 def driver_shape(scanner: Scanner, selection: Selection, name: str, unit: str) -> Driver:
@@ -61,8 +64,9 @@ def driver_shape(scanner: Scanner, selection: Selection, name: str, unit: str) -
     gain = float(estimate.model.gain())
     y = np.where(scanner.present, np.asarray(record.signals["output"]) - predicted, 0.0) / gain
     g = ranking.best_cell(name)
-    w = scanner.cells.whiten(g, np.column_stack([jacobian / gain, columns, y]))
-    p = jacobian.shape[1]
+    beside = np.column_stack([jacobian / gain, _given_up(scanner, selection)])
+    w = scanner.cells.whiten(g, np.column_stack([beside, columns, y]))
+    p = beside.shape[1]
     norm = np.maximum(np.linalg.norm(w[:, :-1], axis=0), 1e-300)
     u, s, vt = np.linalg.svd(w[:, :-1] / norm, full_matrices=False)
     keep = s > 1e-5 * s[0]

@@ -81,7 +81,8 @@ def growing_noise(record: Record, estimate: Estimate) -> Growth | None:
     drivers = variance_drivers(record)
     for label, z in drivers.items():
         x = z[: record.rows][use]
-        statistic = np.corrcoef(x, e)[0, 1] ** 2 * len(e) if e.std() > 0 else 0.0
+        varies = e.std() > 0 and np.ptp(x) > 0
+        statistic = np.corrcoef(x, e)[0, 1] ** 2 * len(e) if varies else 0.0
         if best is None or statistic > best[0]:
             best = (statistic, label, z)
     if best is None or stats.chi2.sf(best[0], 1) * len(drivers) > SIGNIFICANT:

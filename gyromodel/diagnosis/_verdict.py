@@ -76,7 +76,8 @@ def credible(
         same = {k: of_data - scanner.bank.price(k) for k in twins(scanner, ranking, name) - apart}
         own |= {k: max(own.get(k, 0.0), value) for k, value in same.items()}
     # A drift comes back with the next run, a warm-up with the next power-on, and a step does not.
-    again = name == "bias_warmup" and np.ptp(scanner.record.signals.get("run", np.zeros(1))) > 0
+    since_on = np.asarray(scanner.record.signals.get("time_on", np.zeros(1)))[: scanner.record.rows]
+    again = name == "bias_warmup" and bool((np.diff(since_on) < 0).any())
     once = scanner.runs < 2 and not again
     if (once or name == "bias_step") and (hidden or too_close):
         own["noise_random_walk"] = max(0.0, statistic - 1.0)
@@ -120,7 +121,8 @@ def judge(
         findings += told_of_cause(steps, step, extended, {*members, *beside})
         turn = sum(f.name == step.name for f in selection.found[i:])
         least, statistic = steps.least(ranking, step.name), ranking.statistic[step.name]
-        cause = cause_of(scanner, extended, step, turn, ranking, members, statistic, trials, null_scores, least)
+        held = {r.name: r.value for r in steps.baseline.table() if r.effect == step.name and not r.std > 0.0}
+        cause = cause_of(scanner, extended, step, turn, ranking, members, statistic, trials, null_scores, least, held)
         causes.append(replace(cause, places=places(sorted(step.points), searched)) if step.points else cause)
         sets.append(members)
     sets = _with_doubts(causes, sets, extended)

@@ -147,7 +147,7 @@ class Effect(eqx.Module):
 
     def grown_by(self, amplitude: Float[Array, ""]) -> Self:
         """This effect, which continues others, at an amplitude; ValueError beyond what it can be."""
-        return replace(self, **{self._amplitude(): amplitude})
+        return replace(self, **{self.amplitude_name(): amplitude})
 
     @property
     def structure(self) -> str:
@@ -157,9 +157,10 @@ class Effect(eqx.Module):
     @property
     def beyond_reach(self) -> bool:
         """Whether this effect, if it continues others, has a larger amplitude than any that is believed."""
-        return bool(np.isfinite(self.reach) and abs(getattr(self, self._amplitude())) > self.reach)
+        return bool(np.isfinite(self.reach) and abs(getattr(self, self.amplitude_name())) > self.reach)
 
-    def _amplitude(self) -> str:
+    def amplitude_name(self) -> str:
+        """The parameter that is the amplitude of what continues others."""
         return [k for k, declared in self.declared().items() if not declared.linear][-1]
 
     @classmethod

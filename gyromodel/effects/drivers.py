@@ -103,13 +103,17 @@ class BiasPeriodic(Effect):
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """The cosines, then the sines."""
         phase = 2.0 * jnp.pi * signals["time"][:, None] * self.frequency
-        waves = jnp.concatenate([jnp.cos(phase), jnp.sin(phase)], axis=1)
+        kept = _kept(signals, self.frequency)
+        waves = jnp.concatenate([kept * jnp.cos(phase), kept * jnp.sin(phase)], axis=1)
         return waves * _within(signals, self.campaigns * 2) if self.campaigns else waves
 
     def shape_derivatives(self, signals: Signals) -> Float[Array, "sample shape"]:
-        """2πt (B cos 2πft − A sin 2πft), one a line: a jvp would compute every line for each."""
-        turn = 2.0 * jnp.pi * signals["time"][:, None]
-        phase = turn * self.frequency
+        """2πt (B cos 2πft − A sin 2πft), one a line: a jvp would compute every line for each.
+
+        What means keep hardly changes within the resolution of a record.
+        """
+        turn = 2.0 * jnp.pi * signals["time"][:, None] * _kept(signals, self.frequency)
+        phase = 2.0 * jnp.pi * signals["time"][:, None] * self.frequency
         moved = turn * (self.sine * jnp.cos(phase) - self.cosine * jnp.sin(phase))
         return moved * _within(signals, self.campaigns) if self.campaigns else moved
 
@@ -117,6 +121,16 @@ class BiasPeriodic(Effect):
     def candidates(cls, signals: Signals) -> list[Self]:
         """Scanned at every frequency by the search."""
         return []
+
+
+def _kept(signals: Signals, frequency: Float[Array, " line"]) -> Float[Array, "sample line"] | float:
+    """What is left of a line in the mean of n samples, Δ apart: sin(πfnΔ)/(n sin(πfΔ)); all of it in samples."""
+    if "_averaged" not in signals:
+        return 1.0
+    many, turn = signals["_averaged"][:, None], jnp.pi * frequency * signals["_step"][:, None]
+    below = many * jnp.sin(turn)
+    still = jnp.abs(below) < 1e-9
+    return jnp.where(still, 1.0, jnp.sin(many * turn) / jnp.where(still, 1.0, below))
 
 
 def _within(signals: Signals, campaigns: tuple[int, ...]) -> Float[Array, "sample campaign"]:

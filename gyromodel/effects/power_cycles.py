@@ -39,13 +39,13 @@ class BiasTurnOn(Effect):
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """One in each later run."""
-        return (_runs(signals)[:, None] == self.runs).astype(float)
+        return (cycles(signals)[:, None] == self.runs).astype(float)
 
     def prepared(self, signals: Signals) -> Self:
         """Take the runs that the campaign has."""
         if self.runs.size:
             return self
-        numbers = np.asarray(_runs(signals))
+        numbers = np.asarray(cycles(signals))
         later = np.unique(numbers[np.isfinite(numbers) & (numbers != numbers[0])])
         return dataclasses.replace(self, offsets=np.zeros(len(later)), runs=later)
 
@@ -56,6 +56,6 @@ class BiasTurnOn(Effect):
         return [effect] if 0 < effect.runs.size < MOST_RUNS else []
 
 
-def _runs(signals: Signals) -> Float[Array, " sample"]:
+def cycles(signals: Signals) -> Float[Array, " sample"]:
     """Number of the power cycle."""
     return signals["run"] if "run" in signals else signals.get("campaign", jnp.ones_like(signals["time"]))

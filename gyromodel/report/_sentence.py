@@ -122,6 +122,11 @@ def _with_size(cause: Cause) -> str:
     values = [p for p in cause.parameters if math.isfinite(p.value) and p.std != 0.0]
     if any("[" in p.name for p in values):
         values = [p for p in values if p.name in ("coefficient", "time_constant")]
+    if cause.effect == "scale_factor" and len(values) == 1:
+        if values[0].unit != "1":
+            return f"a scale factor of {with_uncertainty(values[0].value, values[0].std, values[0].unit)}"
+        error, std = 1e6 * (values[0].value - 1.0), 1e6 * values[0].std
+        return f"{phrase(cause.effect)} of {with_uncertainty(error, std, 'ppm')}"
     if len(values) == 1:
         return f"{phrase(cause.effect)} of {with_uncertainty(values[0].value, values[0].std, values[0].unit)}"
     sizes = [f"{spoken(p.name)} {with_uncertainty(p.value, p.std, p.unit)}" for p in values]
