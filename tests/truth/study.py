@@ -117,6 +117,7 @@ def run_engine(
         again = gyromodel.diagnose(campaign, found.extended.model_as_given(), hold_out=False)
         adequate = again.verdict == "adequate"
     driver = tuple(found.driver.column.split(" and ")) if found.driver else ()
+    first = (c.statistic for r in found.rounds[:1] for c in r.ranking if c.effect != "outliers")
     measured = found.gain
     return Answer(
         verdict=found.verdict,
@@ -131,6 +132,7 @@ def run_engine(
         driver=driver,
         gain_ratio=(measured.ratio, *measured.ci95),
         gain_score=(measured.log_score, *measured.log_score_ci95),
+        margin=max(first, default=np.nan) - found.threshold,
     )
 
 
