@@ -125,7 +125,7 @@ def _of_means(record: Record, campaigns: Sequence[Campaign], means: Sequence[Cam
     late = [float(m.si("time")[0] - c.si("time")[0]) for c, m in zip(campaigns, means, strict=True)]
     counts = [max(round(float(np.median(np.diff(m.si("time")))) / s), 1) for m, s in zip(means, steps, strict=True)]
     rows, extra = [len(m) for m in means], len(record.sampling.present) - record.rows
-    by_row = (np.pad(np.repeat(each, rows), (0, extra), mode="edge") for each in (late, counts, steps))
+    by_row = (np.pad(np.repeat(np.array(x, float), rows), (0, extra), mode="edge") for x in (late, counts, steps))
     offset, averaged, step = map(jnp.asarray, by_row)
     moved = {name: record.signals[name] + offset for name in ("time", "time_on")}
     return record._replace(signals=record.signals | moved | {"_averaged": averaged, "_step": step})
