@@ -177,8 +177,6 @@ def test_an_interval_after_selection_starts_from_what_was_stated(size: float, to
     lag = TemperatureLag(coefficients=[1e-5], time_constant=100.0, reference=25.0)
     slope = ParameterValue("coefficients", 500.0, 10.0, "deg/h")
     delay = ParameterValue("time_constant", 100.0, 25.0, "s")
-,
-    )
     assert _told(slope, lag, 0.97, True, None) == slope
     assert _told(delay, lag, 0.97, True, None).ci95 is not None
 

@@ -123,7 +123,7 @@ class BiasPeriodic(Effect):
         return []
 
 
-def _kept(signals: Signals, frequency: Float[Array, " line"]) -> Float[Array, "sample line"] | float:
+def _kept(signals: Signals, frequency: Float[Array, " *line"]) -> Float[Array, "sample line"] | float:
     """What is left of a line in the mean of n samples, Δ apart: sin(πfnΔ)/(n sin(πfΔ)); all of it in samples."""
     if "_averaged" not in signals:
         return 1.0

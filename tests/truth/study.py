@@ -132,7 +132,7 @@ def run_engine(
         driver=driver,
         gain_ratio=(measured.ratio, *measured.ci95),
         gain_score=(measured.log_score, *measured.log_score_ci95),
-        margin=max(first, default=np.nan) - found.threshold,
+        margin=max(first, default=-np.inf) - found.threshold,
     )
 
 

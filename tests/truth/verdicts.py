@@ -64,7 +64,7 @@ class Answer:
     driver: tuple[str, ...]
     gain_ratio: tuple[float, float, float]  # value, low, high
     gain_score: tuple[float, float, float]  # nats: value, low, high
-    margin: float = float("nan")  # evidence (nats) of what comes first, but gross errors, over what it needs
+    margin: float = float("-inf")  # evidence (nats) of what comes first, but gross errors, over what it needs
 
 
 @dataclass(frozen=True)
