@@ -103,9 +103,7 @@ def plan_sentence(choice: PlanChoice, outcome: str) -> str:
     }[choice.criterion].format(choice.gain, apart=choice.best.separation)
     than = "than" if choice.criterion != "discrimination" else "as"
     best = f"Best plan ({choice.best.duration / 3600:.3g} h): {parts}."
-    if choice.gain == np.inf:
-        return f"{best} {what.rpartition(',')[0]}; each part in turn does not tell them apart."
-    return f"{best} {what} {than} by each part in turn."
+    return f"{best} {what} {than} by each part as often."
 
 
 def _with_error(value: float, error: float) -> tuple[str, str]:

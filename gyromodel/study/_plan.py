@@ -53,13 +53,13 @@ class TestPlan(NamedTuple):
     """How often to do each part.
 
     Args:
-        times: by part; those not done are left out.
+        times: by part; those not done are left out. Of a plan that does each as often, a part of a time is that share.
         duration: of all, s.
         covariance: of the parameters after it, internal units.
         separation: least distance between two rival effects of typical size, in standard deviations; NaN without.
     """
 
-    times: dict[str, int]
+    times: dict[str, float]
     duration: float
     covariance: Float[np.ndarray, "parameter parameter"]
     separation: float
@@ -73,9 +73,9 @@ class PlanChoice(NamedTuple):
     Args:
         criterion: what was made best.
         best: that plan.
-        equal: each part in turn for as long.
+        equal: each part as often, for as long, whatever their order.
         gain: how many times narrower intervals are by the best plan, in the sense of the criterion; of a
-            discrimination how many times larger the separation is, infinite where only the best has one.
+            discrimination how many times larger the separation is.
     """
 
     criterion: Criterion
@@ -197,19 +197,18 @@ def best_plan(
         total = np.tensordot(n, told, 1)
         covariance = covariance_after(errors, without_shared(total, shared)[:count, :count])
         apart = float(np.exp(separation(total[None])[0] / 2)) if separation else np.nan
-        times = {part.name: int(k) for part, k in zip(parts, n, strict=True) if k}
+        times = {part.name: k.item() for part, k in zip(parts, n, strict=True) if k}
         return TestPlan(times, float(n @ durations), covariance, apart)
 
-    after, before = (float(score(np.tensordot(n, told, 1)[None])[0]) for n in (best, start))
+    equal = np.full(len(parts), budget / durations.sum())
+    after, before = (float(score(np.tensordot(n, told, 1)[None])[0]) for n in (best, equal))
     if criterion == "discrimination" and after <= np.log(LEAST):
         raise ModelError(f"no plan of these candidates tells {' and '.join(rivals)} apart: add another part")
     if criterion == "outcome" and after >= -np.log(LEAST):
         raise ModelError("the outcome has no uncertainty that a test could lessen")
     # Scores are ln det of the information, minus ln variance, and ln separation squared.
     gain = np.exp((after - before) / (2.0 * (count if criterion == "parameters" else 1)))
-    if criterion == "discrimination" and before <= np.log(LEAST):
-        gain = np.inf
-    return PlanChoice(criterion, plan(best), plan(start), float(gain))
+    return PlanChoice(criterion, plan(best), plan(equal), float(gain))
 
 
 def _shared_last(told: Sequence[np.ndarray], kinds: int) -> np.ndarray:
