@@ -45,6 +45,7 @@ def drawn(rng: np.random.Generator, units: int, share: float, size: float) -> tu
     return found, has
 
 
+@pytest.mark.law
 def test_shares_and_units_are_told_as_often_as_they_are_so(seed: int):
     """Drawn from the prior: the interval of the share covers, and of units told with p the part p has the effect."""
     rng, count, covered, off, variance = np.random.default_rng(seed), 200, 0, 0.0, 0.0
@@ -59,6 +60,7 @@ def test_shares_and_units_are_told_as_often_as_they_are_so(seed: int):
     assert abs(off) < 4.5 * math.sqrt(variance), f"seed {seed}"
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("units", [2, 8, 60])
 def test_archives_with_nothing_in_them_show_nothing(units: int, seed: int):
     """ln B exceeds 4 in less than exp(−4) of archives, whatever their size: its mean is one."""
@@ -160,6 +162,7 @@ def test_the_command_tells_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert (effect["effect"], effect["alone"], len(effect["probability"])) == ("bias_drift", 0, 5)
 
 
+@pytest.mark.law
 @pytest.mark.long
 def test_effects_too_weak_for_a_campaign_are_named_over_eight(seed: int):
     """At 0.7 times the minimal detectable size; the benchmark has more archives, and some of half with the effect."""

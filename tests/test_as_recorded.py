@@ -24,12 +24,6 @@ from gyromodel.signals import read_signals, with_columns_known
 DEG_H = np.pi / 180 / 3600
 
 
-@pytest.fixture
-def seed() -> int:
-    """One draw, the same in each run: what is tested is what was recorded, not a verdict's chances."""
-    return 1
-
-
 def campaign(output: np.ndarray, step: float = 10.0, unit: str = "deg/h", kind: str = "rate", **columns: np.ndarray):
     units = {"time": "s", "output": unit, "temperature": "degC", "rate": "deg/s"}
     values = {"time": step * np.arange(len(output)), "output": output, **columns}

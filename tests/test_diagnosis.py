@@ -49,12 +49,6 @@ from tests.truth import study
 ROWS = 256
 
 
-@pytest.fixture
-def seed() -> int:
-    """One draw, the same in each run: verdicts err as often as the threshold allows, which test_discovery measures."""
-    return 1
-
-
 def static_log(rng: np.random.Generator, wrong: np.ndarray | float = 0.0, unit: str = "deg/h") -> gm.Campaign:
     """A static thermal log of 256 rows with white noise of 1 deg/h."""
     time = 20.0 * np.arange(ROWS)
@@ -239,6 +233,7 @@ def test_a_model_the_campaign_does_not_determine_is_refused(rng: np.random.Gener
         gm.diagnose(campaign, gm.model_from_effects(["scale_factor", "bias"]))
 
 
+@pytest.mark.law
 def test_calibration_is_kept_by_design(rng: np.random.Generator, tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     record = read_signals(static_log(rng))
@@ -281,6 +276,7 @@ def test_calibration_draws_meet_the_noise_cells_they_need(flicker: float, walk: 
     assert np.abs(points[0] - points[1]).max() < 0.45
 
 
+@pytest.mark.law
 @pytest.mark.parametrize(("draws", "share"), [(200, 0.866), (500, 0.95), (2000, 0.95)])
 def test_a_threshold_of_draws_is_beyond_the_99_percent_point(
     draws: int, share: float, rng: np.random.Generator
@@ -479,11 +475,12 @@ def test_many_residuals_at_once_are_searched_like_each_alone(rng: np.random.Gene
             assert together[g].evidence[name][7] == pytest.approx(evidence, abs=within)
 
 
+@pytest.mark.law
 @pytest.mark.long
 @pytest.mark.parametrize(("size", "walk"), [(1.0, 0.0), (5.0, 0.0), (20.0, 0.0), (5.0, 0.1)])
-def test_the_interval_of_an_epoch_holds_it(size: float, walk: float) -> None:
+def test_the_interval_of_an_epoch_holds_it(size: float, walk: float, rng: np.random.Generator) -> None:
     """A step of a size in standard deviations of one sample, at any moment, in noise with a random walk or without."""
-    rng, draws = np.random.default_rng(), 150
+    draws = 150
     log = static_log(rng)
     log = log.select(np.delete(np.arange(ROWS), rng.choice(np.arange(1, ROWS - 1), 20, replace=False)))
     record = read_signals(log)

@@ -23,12 +23,6 @@ RUNS, ROWS = 4, 80
 WARM, LEANS = 1e-2, np.array([5e-4, 4e-4])
 
 
-@pytest.fixture
-def seed() -> int:
-    """One draw, the same in each run: verdicts err as often as the threshold allows, which test_discovery measures."""
-    return 1
-
-
 def log(rng: np.random.Generator, throughout: bool = False) -> gm.Campaign:
     """Runs in one of which the unit turns about y, and in another about z: each lean is determined by one block.
 

@@ -76,6 +76,7 @@ def test_the_noise_and_the_scale_factor_must_be_stated():
         isolability(log(np.arange(50.0)), model_from_effects(["bias"]))
 
 
+@pytest.mark.law
 def test_the_predicted_distance_is_the_measured_rate_of_confusion(rng: np.random.Generator):
     """Two effects at a size where 20 % of campaigns should prefer the wrong one by least squares."""
     i = np.arange(300)

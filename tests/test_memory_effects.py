@@ -320,6 +320,7 @@ def test_a_sweep_of_rates_is_no_steps_of_the_output(rng: np.random.Generator):
     assert steps_of_output(gm.Campaign(columns, units, {"kind": "rate"})) is None
 
 
+@pytest.mark.law
 @pytest.mark.parametrize(
     ("quantum", "repeats", "said"), [(0.0, 4, False), (0.0, 7, True), (0.05, 6, False), (0.05, 40, True)]
 )

@@ -68,6 +68,7 @@ def test_a_steady_line_is_never_said_to_change(walk: float, rng: np.random.Gener
         assert unsteady_lines(fit_record(read_signals(log(line + noise)), model)) == [False]
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("logs", [2, pytest.param(20, marks=pytest.mark.long)])
 def test_the_band_of_what_sweeps_is_told_of_and_noise_alone_has_none(logs: int, rng: np.random.Generator) -> None:
     """A chirp from 0.1 to 0.14 Hz; noise of its own in each log, beside it or alone.

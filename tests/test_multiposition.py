@@ -93,7 +93,14 @@ def test_least_squares_of_all_six_uses_what_the_closed_forms_leave(rng: np.rando
     """Df is in six currents and (6) takes two: variance 1/3, the scale factor being known."""
     design = np.stack([np.ones(6), *(np.asarray(c) for c in six_positions(LATITUDE)[:2])], axis=1)
     best = np.linalg.inv(design.T @ design)[0, 0]
-    known = Uncertain.stated(jnp.zeros(6), 1.0, "currents").propagate(lambda i: (i[0] + i[1]) / 2)
+    currents = StaticModel(*(jnp.asarray(x) for x in (2.0, 0.3, 0.1, -0.2))).current(six_positions(LATITUDE))
+
+    def drift(i):
+        """Equation (6) in currents."""
+        found = six_position(i, LATITUDE)
+        return found.fixed_drift / found.scale_factor
+
+    known = Uncertain.stated(currents, 1.0, "currents").propagate(drift)
     assert best / known.covariance[0, 0] == pytest.approx(1 / 3)
 
 

@@ -39,6 +39,7 @@ def white(rng: np.random.Generator) -> np.ndarray:
     return truth.white(ROWS, STEP, WHITE, rng)
 
 
+@pytest.mark.law
 @pytest.mark.long
 def test_quantisation_of_the_angle_has_its_size(rng: np.random.Generator):
     """An angle counted in whole steps: its rounding errors have a variance of a twelfth of a step squared."""
@@ -51,6 +52,7 @@ def test_quantisation_of_the_angle_has_its_size(rng: np.random.Generator):
     assert binom.cdf(inside, len(sizes), 0.93) > RARE
 
 
+@pytest.mark.law
 @pytest.mark.long
 def test_hops_between_two_levels_have_their_size_and_times(rng: np.random.Generator):
     size, times = 3.0 * WHITE / np.sqrt(STEP), (1600.0, 1000.0)
@@ -65,6 +67,7 @@ def test_hops_between_two_levels_have_their_size_and_times(rng: np.random.Genera
     assert binom.cdf(sum(hits), len(hits), 0.93) > RARE
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("kind", [*truth.FAMILY, "markov", "student_t3"])
 def test_other_noise_is_neither(kind: str, rng: np.random.Generator):
     index = np.arange(ROWS)
@@ -87,6 +90,7 @@ def test_a_coarse_readout_is_no_hop(monkeypatch: pytest.MonkeyPatch):
     assert telegraph(coarse, coarse, "rad/s") is not None
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("strength", [0.3, 0.8])
 def test_many_fast_lines_are_no_quantisation(strength: float, rng: np.random.Generator):
     """Fifteen lines above 0.3 times the sample rate raise half of the spectrum; 26 of 300 logs were let through."""
@@ -98,6 +102,7 @@ def test_many_fast_lines_are_no_quantisation(strength: float, rng: np.random.Gen
     assert binom.sf(false - 1, 16, 0.12) > RARE
 
 
+@pytest.mark.law
 def test_hops_at_changes_of_position_are_not_the_gyros(rng: np.random.Generator):
     """Positions that begin where the level changes, and positions of three rows that have nothing to do with it."""
     false, found = 0, 0

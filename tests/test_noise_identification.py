@@ -162,6 +162,7 @@ def test_each_kind_is_found_beside_white_noise(key: str, size: float, fixed: np.
         assert low < true < high, (name, term)
 
 
+@pytest.mark.law
 @pytest.mark.long
 def test_white_noise_alone_is_seldom_anything_else(rng: np.random.Generator):
     """Eight records: each other kind exceeds its threshold in 0.5 % of them, and four kinds are tried."""
@@ -199,6 +200,7 @@ def test_lines_and_trend_are_taken_out_of_the_noise(fixed: np.random.Generator):
     assert found.fits
 
 
+@pytest.mark.law
 @pytest.mark.parametrize("walk", [0.0, 0.02])
 def test_noise_alone_seldom_shows_a_line(walk: float, rng: np.random.Generator):
     """One record in a thousand, in white noise and above a random walk; the shortest have a window for a spectrum."""
@@ -209,6 +211,7 @@ def test_noise_alone_seldom_shows_a_line(walk: float, rng: np.random.Generator):
     assert binom.sf(found - 1, 400, 1e-3) > RARE
 
 
+@pytest.mark.law
 @pytest.mark.long
 def test_limits_of_lines_and_of_unseen_markov_noise_hold(rng: np.random.Generator):
     """A line, and a Markov process too small to be found: its bound holds, and is not far above it."""

@@ -133,6 +133,7 @@ def test_an_axis_that_nothing_explains_moves_no_value():
     assert not unexplained_axes(diagnosis.extended)
 
 
+@pytest.mark.law
 @pytest.mark.long
 def test_probabilities_of_axes_are_uniform_where_all_is_explained(seed: int):
     found = [axis_probabilities(fit_vibration(vibration(seed=seed + k), NOTHING)) for k in range(20)]

@@ -106,6 +106,7 @@ def test_dither_leaves_a_band_of_the_bessel_function(order: int, rng: np.random.
     assert np.abs(model - counted).max() < 1.1 * least
 
 
+@pytest.mark.law
 def test_random_dither_leaves_the_random_walk_of_the_formula(rng: np.random.Generator) -> None:
     """Turns that are far apart in phase: the formula holds within the spread of a variance and 15 % for its order."""
     depth, periods, lanes = 30.0, 30, 300

@@ -131,16 +131,3 @@ def test_too_few_soaks_are_refused():
         fit_temperature_model({"SF": few}, few, "split", split=80.0)
     with pytest.raises(EstimateError, match="soaks: hinge needs 7 soaks"):
         fit_temperature_model({"SF": few}, few, "hinge", hinges=2)
-
-
-def test_the_printed_total_error_does_not_follow_from_the_printed_parts():
-    """St² = S² + (dSF/dt)² S_t² with S_SF = 0.00539 and St = 0.01169: the slope it needs is 7 to 15 % of SF per °C.
-
-    The largest coefficient of a torquer's magnet is ferrite's, −0.2 % per °C.
-    """
-    rest = np.sqrt(0.01169**2 - 0.00539**2)
-    assert rest == pytest.approx(0.01037, abs=1e-5)
-    slopes = rest / np.array([0.015938, 0.007603])
-    assert slopes == pytest.approx([0.65, 1.36], abs=0.005)
-    assert slopes / 9.29 == pytest.approx([0.070, 0.147], abs=1e-3)
-    assert np.hypot(0.00539, 0.002 * 9.29 * 0.015938) == pytest.approx(0.00540, abs=5e-6)

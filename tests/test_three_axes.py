@@ -82,6 +82,7 @@ def test_a_lean_wants_all_three_axes_turned(rng: np.random.Generator):
     assert str(still.to_dict()["not_told"]) in still.sentence()
 
 
+@pytest.mark.law
 @pytest.mark.long
 def test_axes_as_they_should_be_say_so(rng: np.random.Generator):
     """A true triad is called turned, or not square, once in a thousand each."""

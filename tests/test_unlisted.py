@@ -162,6 +162,7 @@ def test_noise_of_a_thermometer_is_nothing_that_a_simulation_lacks(rng: np.rando
     assert (found.verdict, found.causes, found.driver) == ("adequate", (), None)
 
 
+@pytest.mark.law
 @pytest.mark.long
 def test_a_thermometer_is_smoothed_where_its_noise_is_its_own_alone(rng: np.random.Generator):
     """In three draws of four or more, and in one of ten or fewer where the bias follows what was read."""
