@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from scipy.stats import binomtest
 
-from benchmarks._kept import Kept
+from benchmarks._kept import Kept, code
 from tests.truth import levels, study
 from tests.truth.campaigns import HOMES, MOTION, TESTABLE, known
 from tests.truth.verdicts import allowed
@@ -69,10 +69,11 @@ def write_page(output: Path, whole: list[Kept]) -> None:
     figures = {k: output.with_name(f"{output.stem}_{k}.png") for k in ("confusion", "power")}
     commands = [f"    python -m benchmarks.discovery --seed {k.path.stem[5:-5]} --scale {k.scale:g}" for k in whole]
     made = ", ".join(dict.fromkeys(k.code for k in whole))
+    other = "" if made.endswith(code()) else f", before that of today's checkout, {code()}"
     lines = [
         "# Hidden-effect study",
         "",
-        f"{sum(map(len, parts.values()))} campaigns, by the engine {made} (a digest: `benchmarks/_kept.py`). Made by",
+        f"{sum(map(len, parts.values()))} campaigns, by the engine {made} (a digest: `benchmarks/_kept.py`){other}. Made by",
         "",
         *commands,
         "",

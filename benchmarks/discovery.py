@@ -48,6 +48,9 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--output", type=Path, default=RESULTS / "discovery.md")
     parser.add_argument("--kept", type=Path, default=RESULTS / "discovery", help="folder of what was run")
     parser.add_argument("--page", action="store_true", help="make the page of what is there")
+    parser.add_argument(
+        "--go-on", action="store_true", help="go on also with another engine, which the page then names"
+    )
     return parser.parse_args(argv)
 
 
@@ -127,8 +130,9 @@ def main(argv: list[str] | None = None) -> None:
         )
     if not args.page:
         kept = Kept(args.kept / f"seed_{args.seed}.json.gz")
-        made = code(), args.scale
-        if kept.parts and (kept.code, kept.scale) != made:
+        before = kept.code.split(" and ") if kept.parts and args.go_on else []
+        made = " and ".join(dict.fromkeys([*before, code()])), args.scale
+        if kept.parts and (made[1] != kept.scale or (made[0] != kept.code and not args.go_on)):
             raise SystemExit(
                 f"{kept.path} was made by code {kept.code} at scale {kept.scale:g}, and this is {made[0]} at "
                 f"{made[1]:g}: take another --seed, or remove it"
@@ -149,7 +153,7 @@ def main(argv: list[str] | None = None) -> None:
     found = [Kept(path) for path in sorted(args.kept.glob("seed_*.json.gz"), key=lambda path: int(path.stem[5:-5]))]
     whole = [k for k in found if k.seconds]
     # Of one engine: this one, where it has been studied.
-    whole = [k for k in whole if k.code == code()] or whole
+    whole = [k for k in whole if k.code.endswith(code())] or whole
     if not whole:
         raise SystemExit(f"{args.kept} holds no finished study")
     write_page(args.output, whole)

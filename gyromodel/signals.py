@@ -30,6 +30,9 @@ IRREGULAR, MOST_REGULAR = 0.01, 0.9
 # Bits of counters that start anew. Of the rows with an output, the share that may follow one without where an output
 # counts from the row before.
 COUNTERS, MOST_ALONE = (8, 10, 12, 14, 16, 18, 20, 24, 32), 0.5
+# How much faster than elsewhere an angle may turn where it starts anew, and how far most of the samples of a clock are
+# from whole steps of it, in steps.
+AS_BEFORE, JITTER = 2.0, 0.05
 # A column missing in more than this share of the rows is not searched; rows without one of the others are left out.
 MOST_MISSING = 0.2
 
@@ -125,33 +128,37 @@ def rate_output(campaign: Campaign) -> tuple[np.ndarray, str]:
             f"{campaign.name}: most rows with an output follow one without, and an {kind} counts from the row before: "
             "leave out the rows between"
         )
-    if kind == "angle":
-        if (turn := _wraps_within(output, unit)) is not None:
-            raise CampaignError(f"{campaign.name}: the angle in 'output' wraps round within {turn}; unwrap it")
-        output = np.diff(output, prepend=np.nan)
     interval = np.diff(campaign.si("time"), prepend=np.nan)
     typical = np.median(interval[1:])
+    if kind == "angle":
+        turned = np.diff(output)[interval[1:] <= MISSING_STEP * typical]
+        if (turn := _wraps_within(output, turned, unit)) is not None:
+            raise CampaignError(f"{campaign.name}: the angle in 'output' wraps round within {turn}; unwrap it")
+        output = np.diff(output, prepend=np.nan)
     # How long the first increment took is known only from a regular clock.
-    if _regular(interval[1:], typical):
+    if np.mean(np.abs(interval[1:] - typical) < IRREGULAR * typical) > MOST_REGULAR:
         interval[0] = typical
     # What was turned through during a gap is not known: the first increment behind one is missing.
     return np.where(interval > MISSING_STEP * typical, np.nan, output / interval), f"{unit}/s"
 
 
-def _wraps_within(angle: np.ndarray, unit: str) -> str | None:
-    """What an angle starts anew after, in words; None where it does not."""
+def _wraps_within(angle: np.ndarray, turned: np.ndarray, unit: str) -> str | None:
+    """What an angle starts anew after, in words; None where it does not.
+
+    Args:
+        angle: where it is known, and not finite elsewhere.
+        turned: by how much it changes from sample to sample.
+        unit: of both.
+    """
     turns = {"one turn": 2 * np.pi} if unit == "rad" else {f"2^{bits} {unit}s": 2.0**bits for bits in COUNTERS}
-    known, jump = angle[np.isfinite(angle)], np.nanmax(np.abs(np.diff(angle)), initial=0.0)
+    known, size = angle[np.isfinite(angle)], np.abs(turned[np.isfinite(turned)])
     reach = np.ptp(known) if len(known) else 0.0
     words, turn = next(((w, t) for w, t in turns.items() if reach <= t), ("", np.inf))
-    # A counter that starts anew has been through all that it can show.
+    jumps, others = size[size > 0.5 * turn], size[size <= 0.5 * turn]
+    # A counter that starts anew has been through all that it can show, and went on as it did before.
     passed = unit == "rad" or reach > 0.9 * turn
-    return words if passed and jump > 0.5 * turn else None
-
-
-def _regular(step: np.ndarray, usual: float) -> bool:
-    """Whether nearly all of some steps are the usual one."""
-    return bool(np.mean(np.abs(step - usual) < IRREGULAR * usual) > MOST_REGULAR)
+    on = np.abs(turn - jumps) <= AS_BEFORE * others.max(initial=0.0)
+    return words if passed and on.any() else None
 
 
 def rate_scale(stated: str, unit: str) -> float:
@@ -230,10 +237,13 @@ def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
         schemes.add(scheme)
     signals = {n: np.concatenate(v) for n, v in parts.items()}
     if len(campaigns) > 1:
-        # White noise is the same in all of them, and its samples scatter less where they are further apart.
+        # White noise is the same in all of them, and its samples scatter less where they are further apart. Where some
+        # have no clock, a sample of any counts as one of another.
         step = _usual_step(*(signals[n] for n in ("_interval", "_restart", "output")))
         each = [_own_step(*own) for own in zip(*(parts[n] for n in ("_interval", "_restart", "output")), strict=True)]
-        signals["_white"] = np.repeat([step / (own or step) for own in each], [len(v) for v in parts["output"]])
+        white = [step / own for own in each if own is not None]
+        if len(white) == len(each):
+            signals["_white"] = np.repeat(white, [len(v) for v in parts["output"]])
     units = {"campaign": ""} | {n: campaigns[0].units[n] for n in names}
     record = laid_out(signals, np.concatenate(blocks), " and ".join(sorted(schemes)), unit, units)
     return record._replace(data_hash="+".join(c.digest() for c in campaigns))
@@ -252,7 +262,8 @@ def _usual_step(interval: np.ndarray, restart: np.ndarray, output: np.ndarray) -
 def _own_step(interval: np.ndarray, restart: np.ndarray, output: np.ndarray) -> float | None:
     """A campaign's sample interval (s); none where its rows have no clock, as the dwells of a test."""
     usual, known = _usual_step(interval, restart, output), np.flatnonzero(np.isfinite(output))
-    return usual if _regular(np.diff(np.cumsum(interval)[known]), usual) else None
+    steps = np.diff(np.cumsum(interval)[known]) / usual
+    return usual if len(steps) and np.median(np.abs(steps - np.rint(steps))) < JITTER else None
 
 
 def _counted_on(runs: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -172,6 +172,16 @@ def test_an_angle_that_starts_anew_is_refused(unit: str, turn: float, words: str
         assert read_signals(campaign(time, whole, unit, "angle")).present.sum() == ROWS - 3
 
 
+def test_an_angle_that_only_jumps_as_far_is_none_that_starts_anew():
+    """Across a pause, or to and fro between two places: nothing goes on as it did before."""
+    time = np.r_[np.arange(20.0), 120.0 + np.arange(20.0)]
+    paused = np.r_[np.linspace(0.0, 4.0, 20), np.linspace(240.0, 244.0, 20)]
+    assert read_signals(campaign(time, paused, "count", "angle")).present.sum() == 38
+    fro = np.where(np.arange(40) // 6 % 2, 243.0, 0.0) + np.linspace(0.0, 0.5, 40)
+    for unit in ("count", "deg"):
+        assert read_signals(campaign(np.arange(40.0), fro, unit, "angle")).present.sum() == 39
+
+
 @pytest.mark.parametrize("kind", ["increment", "angle"])
 def test_increments_in_some_rows_only_count_from_none(kind: str, rng: np.random.Generator):
     output = np.where(np.arange(ROWS) % 4 == 0, rng.standard_normal(ROWS), np.nan)
@@ -189,10 +199,13 @@ def test_the_interval_is_that_of_rows_with_an_output(every: int, rng: np.random.
 def test_white_noise_of_campaigns_goes_by_their_intervals(rng: np.random.Generator):
     """N is the unit's: samples a hundredth as long scatter by ten times as much; dwells have no clock."""
     fast, slow = (campaign(np.arange(n) * s, rng.standard_normal(n)) for n, s in ((300, 0.01), (200, 1.0)))
-    dwells = campaign(np.cumsum(rng.uniform(0.5, 1.5, 50)), rng.standard_normal(50))
-    record = read_signals([fast, slow, dwells])
+    uneven = campaign(np.arange(90) * 0.1 + rng.uniform(-0.003, 0.003, 90), rng.standard_normal(90))
+    record = read_signals([fast, slow, uneven])
     white = np.asarray(record.sampling.white)[: record.rows]
-    assert record.interval / white == pytest.approx(np.repeat([0.01, 1.0, record.interval], [300, 200, 50]))
+    assert record.interval / white == pytest.approx(np.repeat([0.01, 1.0, 0.1], [300, 200, 90]), rel=0.02)
+    # Rows that are dwells have no clock: then a sample of any counts as one of another, however many there are.
+    dwells = campaign(np.cumsum(rng.uniform(40.0, 80.0, 250)), rng.standard_normal(250))
+    assert (np.asarray(read_signals([slow, dwells]).sampling.white) == 1.0).all()
 
 
 def test_missing_outputs_are_not_present(rng: np.random.Generator):

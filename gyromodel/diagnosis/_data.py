@@ -105,15 +105,19 @@ def _of_gyro(measured: Sequence[Campaign]) -> Data:
     if any(m > 1 for _, m in shortened):
         record = _of_means(record, campaigns, searched)
     if "run" in searched[0].columns and "run" not in as_given[0].columns:
-        # Nothing tells that the gyro was off between the stretches.
-        since = float(searched[0].metadata.get("time_since_power_on", 0.0))
-        record = record._replace(signals=record.signals | {"time_on": record.signals["time"] + since})
+        record = _without_power_cycles(record, searched[0])
     output_unit = campaigns[0].units["output"]
     if campaigns[0].metadata["kind"] != "rate":
         output_unit = f"{output_unit}/s"
     whole = searched[0] if len(searched) == 1 else _together(searched)
     rows_of = tuple((c, len(c) == len(m)) for c, m in zip(searched, measured, strict=True))
     return Data(record, searched, rows_of, whole, tuple(findings), _rate_unit(campaigns[0]), output_unit)
+
+
+def _without_power_cycles(record: Record, campaign: Campaign) -> Record:
+    """The record of one campaign, its runs being stretches: nothing tells that the gyro was off between them."""
+    since = float(campaign.metadata.get("time_since_power_on", 0.0))
+    return record._replace(signals=record.signals | {"time_on": record.signals["time"] + since})
 
 
 def _of_means(record: Record, campaigns: Sequence[Campaign], means: Sequence[Campaign]) -> Record:

@@ -130,6 +130,8 @@ class LineGrid:
 def line_grid(record: Record) -> LineGrid | None:
     """A quarter of the record's resolution, up to half the sample rate; None where that leaves no frequency."""
     time = np.asarray(record.signals["time"])
+    # Where a run begins turns the phases alone.
+    time = time - time[np.searchsorted(record.run, record.run)]
     span = record.span
     grid = record.interval
     if np.abs(time[: record.rows] / grid - np.round(time[: record.rows] / grid)).max() > 0.1:

@@ -147,8 +147,10 @@ def _unit(ratio: np.ndarray, likely: np.ndarray, best: float) -> float:
 
     A likelihood that has its say near the best may be flat far beyond, where there is next to no white noise.
     """
-    none = ratio[likely].min() == ratio.min()
-    return LINEAR * float(np.sqrt(ratio.max() or 1.0)) if none else float(np.sqrt(best))
+    least = float(ratio[likely].min())
+    if least == ratio.min():
+        return LINEAR * float(np.sqrt(ratio.max() or 1.0))
+    return float(np.sqrt(best or least))
 
 
 def _on_scale(ratio: np.ndarray, unit: float) -> np.ndarray:
