@@ -73,7 +73,8 @@ def write_page(output: Path, whole: list[Kept]) -> None:
     lines = [
         "# Hidden-effect study",
         "",
-        f"{sum(map(len, parts.values()))} campaigns, by the engine {made} (a digest: `benchmarks/_kept.py`){other}. Made by",
+        f"{sum(map(len, parts.values()))} campaigns, by the engine {made} (a digest: `benchmarks/_kept.py`){other}.",
+        "Made by",
         "",
         *commands,
         "",

@@ -69,7 +69,8 @@ def compensate(campaign: Campaign, calibration: Calibration) -> Campaign:
     rated = with_reference_rates(campaign)[0] if turned else campaign
     known = np.isin(campaign.columns["time"], rated.columns["time"])
     compensated, counts = apply_calibration(campaign, read_signals(rated), calibration, known)
-    return compensated.with_metadata(told(calibration, campaign, counts))
+    numbers = {*np.unique(campaign.columns.get("campaign", np.ones(1))).tolist()}
+    return compensated.with_metadata(told(calibration, campaign, counts, numbers))
 
 
 def apply_calibration(
@@ -184,8 +185,17 @@ def _counts(calibration: Calibration, record: Record, rate: np.ndarray, std: np.
     return counts
 
 
-def told(calibration: Calibration, campaign: Campaign, counts: Counter[str]) -> dict[str, str | None]:
-    """Metadata of a compensated campaign: what its uncertainty holds, and what a user must know, a sentence each."""
+def told(
+    calibration: Calibration, campaign: Campaign, counts: Counter[str], numbers: set[float]
+) -> dict[str, str | None]:
+    """Metadata of a compensated campaign: what its uncertainty holds, and what a user must know, a sentence each.
+
+    Args:
+        calibration: that was applied.
+        campaign: its columns.
+        counts: see `_counts`.
+        numbers: of the campaigns that the data are of.
+    """
     model, notes, present = calibration.model, [], counts["present"]
     if lost := counts["lost"]:
         notes.append(
@@ -207,10 +217,9 @@ def told(calibration: Calibration, campaign: Campaign, counts: Counter[str]) -> 
                 "what turn-ons differ by is not in rate_estimated_std."
             )
     for effect in model.effects:
-        numbers = {*getattr(effect, "campaigns", ()), getattr(effect, "campaign", 0)} - {0}
-        here = {*np.unique(campaign.columns["campaign"])} if "campaign" in campaign.columns else {1}
-        if numbers - here:
-            others = listed(sorted(map(str, numbers - here)))
+        of = {*getattr(effect, "campaigns", ()), getattr(effect, "campaign", 0)} - {0}
+        if of - numbers:
+            others = listed(sorted(map(str, of - numbers)))
             notes.append(
                 f"{effect.label} was in campaign {others} of those that were fitted, and is not in these data."
             )

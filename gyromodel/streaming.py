@@ -53,10 +53,11 @@ class Streamed(NamedTuple):
 
 
 class _Scan(NamedTuple):
-    """What only the whole file tells: the first time and the median step (s)."""
+    """What only the whole file tells: the first time and the usual step (s), and the campaigns that rows are of."""
 
     start: float
     interval: float
+    campaigns: set[float]
 
 
 def compensate_file(
@@ -106,7 +107,7 @@ def compensate_file(
                 errors.write(pair.T.tobytes())
             body.write(done)
         assert head is not None
-        head = head.with_metadata(told(calibration, head, counts))
+        head = head.with_metadata(told(calibration, head, counts, scan.campaigns))
         judgement = _judgement(errors)
         if accept:
             accept(judgement)
@@ -163,15 +164,19 @@ def _scanned(path: Path, axis: str | None, calibration: Calibration) -> _Scan | 
             return None
     needed = {name for effect in calibration.model.effects for name in effect.columns_needed} - {"rate"}
     steps, scan, row = Counter[float](), None, 1
-    last, end, lowest, highest = None, np.zeros(0), np.inf, -np.inf
+    last, end, lowest, highest, numbers = None, np.zeros(0), np.inf, -np.inf, set[float]()
     for part in _parts(path, axis):
         if part.outputs != ("output",) or part.metadata.get("kind") != "rate":
             return None
         check_time(part.columns["time"], row, last)
         row, last = row + len(part), float(part.columns["time"][-1])
         time, output = part.si("time"), part.columns["output"]
-        steps.update(np.diff(np.concatenate([end, time])).tolist())
-        known, end = np.isfinite(output), time[-1:]
+        known = np.isfinite(output)
+        # From one row with an output to the next.
+        seen = np.concatenate([end, time[known]])
+        steps.update(np.diff(seen).tolist())
+        end = seen[-1:]
+        numbers |= {*np.unique(part.columns.get("campaign", np.ones(1))).tolist()}
         lowest = np.min(output[known], initial=lowest)
         highest = np.max(output[known], initial=highest)
         faulty = any((np.abs(values) > LARGEST).any() for values in part.columns.values())
@@ -182,7 +187,7 @@ def _scanned(path: Path, axis: str | None, calibration: Calibration) -> _Scan | 
             scan = _begun(part, needed, calibration)
             if scan is None:
                 return None
-    return scan._replace(interval=_median(steps)) if scan and lowest < highest else None
+    return scan._replace(interval=_median(steps), campaigns=numbers) if scan and lowest < highest else None
 
 
 def _begun(part: Campaign, needed: set[str], calibration: Calibration) -> _Scan | None:
@@ -201,7 +206,7 @@ def _begun(part: Campaign, needed: set[str], calibration: Calibration) -> _Scan 
     unknown = jnp.full_like(signals["time"], jnp.nan)
     if np.isnan(np.asarray(model.predict(signals | dict.fromkeys(lost, unknown)))).any():
         return None
-    return _Scan(float(part.si("time")[0]), np.nan)
+    return _Scan(float(part.si("time")[0]), np.nan, set())
 
 
 def _median(steps: Counter[float]) -> float:

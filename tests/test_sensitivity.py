@@ -456,9 +456,14 @@ def test_the_gain_of_a_plan_knows_no_order_of_its_parts():
     calibration = known(thermal(COVARIANCE, WHITE_ALONE))
     forth, back = (best_plan(calibration, each, 2.5 * ROWS * STEP) for each in (parts, parts[::-1]))
     assert forth.gain == pytest.approx(back.gain, rel=1e-9)
-    assert forth.equal.times == dict.fromkeys(("20", "30", "45", "60"), 0.625)
-    assert forth.equal.duration == 2.5 * ROWS * STEP
+    assert forth.equal.times == dict.fromkeys(("20", "30", "45", "60"), 0.5)
+    assert forth.equal.duration == forth.best.duration == 2 * ROWS * STEP
     assert "by each part as often" in plan_sentence(forth, "angle")
+    # One of two that are both needed is no better than half of each.
+    line = known(Calibration(gyro(LINE), np.eye(2)))
+    one = best_plan(line, levels([0, 2]), 119.0, anew=True)
+    assert one.gain < 1.0
+    assert "Each part as often, in shares, would tell more" in plan_sentence(one, "angle")
 
 
 def test_an_instrument_s_error_is_one_in_all_parts():

@@ -15,7 +15,7 @@ from gyromodel import _compensate_files, cli, streaming
 from gyromodel._checks import CampaignError
 from gyromodel.campaign import Campaign
 from gyromodel.compensation import compensate, reference_error
-from gyromodel.effects.drivers import Bias, BiasDrift
+from gyromodel.effects.drivers import Bias, BiasDrift, BiasStep
 from gyromodel.effects.geometry import TableTilt
 from gyromodel.effects.scale import ScaleFactor, ScaleNonlinearity
 from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureRate, BiasWarmup
@@ -60,6 +60,24 @@ def campaign(rng: np.random.Generator) -> Campaign:
 
 def text_of(path: Path) -> bytes:
     return gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+
+
+def test_outputs_in_some_rows_of_some_campaigns_are_those_of_the_whole(tmp_path: Path, rng: np.random.Generator):
+    sparse = campaign(rng)
+    output = np.where(np.arange(ROWS) % 4 == 0, sparse.columns["output"], np.nan)
+    numbered = sparse.with_column("campaign", 1.0 + np.arange(ROWS) // (ROWS // 2 + 1), "")
+    write_campaign(numbered.with_column("output", output, "count/s"), tmp_path / "a.csv")
+    steps = tuple(BiasStep(size=jnp.asarray(1e-4), epoch=jnp.asarray(1.0), campaign=k) for k in (1, 3))
+    calibration = Calibration(GyroModel((*EFFECTS[:2], *steps), {"noise_white": 1e-5}))
+    whole = compensate(read_campaign(tmp_path / "a.csv"), calibration)
+    done = streaming.compensate_file(tmp_path / "a.csv", tmp_path / "b.csv", calibration)
+    again = read_campaign(tmp_path / "b.csv")
+    assert done is not None
+    assert done.note == whole.metadata["rate_estimated_note"]
+    assert "bias_step was in campaign 3" in done.note
+    assert "campaign 1" not in done.note
+    for name in ("rate_estimated", "rate_estimated_std"):
+        np.testing.assert_allclose(again.columns[name], whole.columns[name], rtol=1e-9)
 
 
 @pytest.mark.parametrize("kinds", ["csv csv", "csv.gz csv.gz", "parquet parquet", "csv parquet", "parquet csv"])

@@ -19,8 +19,8 @@ from scipy.special import ndtr
 
 # Levels of each spread, and how far beyond the scatter of the estimates they reach.
 LEVELS, BEYOND = 40, 6.0
-# Chance that an archive without outlying units, or drifts, shows one.
-FALSE_ALARM = 0.01
+# Chance that an archive without outlying units, or drifts, shows one; and below which chances are not told apart.
+FALSE_ALARM, RAREST = 0.01, 1e-6
 # Units so many robust standard deviations from the median are suspect, and only these are held against the others.
 SUSPECT = 2.0
 # Of a normal distribution: standard deviations in a median absolute deviation.
@@ -84,10 +84,12 @@ class Parameter(NamedTuple):
         """What stands out."""
         name = f"{self.parameter} {self.axis}".strip()
         for o in self.outliers:
-            rare = float(f"{0.5 / stats.norm.sf(abs(o.deviations)):.2g}")
+            chance = 2.0 * float(stats.norm.sf(abs(o.deviations)))
+            share = f"one in {float(f'{1 / max(chance, RAREST):.2g}'):,.0f}"
+            share = share if chance > RAREST else f"less than {share}"
             yield (
                 f"Unit {o.unit} stands out: its {name} is {o.value:.4g} {self.unit}, where the others lead to expect "
-                f"({o.expected:.4g} ± {o.std:.2g}) {self.unit}; of such units one in {rare:,.0f} would be as far off."
+                f"({o.expected:.4g} ± {o.std:.2g}) {self.unit}; of such units {share} would be as far off."
             )
         for d in self.drifts:
             yield f"Unit {d.unit} drifts: its {name} changes by ({d.rate:.3g} ± {d.std:.2g}) {self.unit} per {d.per}."

@@ -96,13 +96,15 @@ def disagreements(found: Sensitivity) -> list[str]:
 def plan_sentence(choice: PlanChoice, outcome: str) -> str:
     """The best plan in words; the outcome's name for a plan that is best for it."""
     parts = ", ".join(f"{count} × {name}" for name, count in choice.best.times.items())
+    best = f"Best plan ({choice.best.duration / 3600:.3g} h): {parts}."
+    if choice.gain < 1.0:
+        return f"{best} Each part as often, in shares, would tell more."
     what = {
         "parameters": "Intervals of the parameters are {:.2f} times narrower",
         "outcome": f"The interval of {outcome} is {{:.2f}} times narrower",
         "discrimination": "The rivals, of typical size, lie {apart:.3g} standard deviations apart, {:.2f} times as far",
     }[choice.criterion].format(choice.gain, apart=choice.best.separation)
     than = "than" if choice.criterion != "discrimination" else "as"
-    best = f"Best plan ({choice.best.duration / 3600:.3g} h): {parts}."
     return f"{best} {what} {than} by each part as often."
 
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from gyromodel.averages import average
+from gyromodel.averages import MAXIMUM_ROWS, average
 from gyromodel.campaign import Campaign
 from gyromodel.estimate import check_covariates
 from gyromodel.model import GyroModel, ModelError, check_units
@@ -23,7 +23,7 @@ from gyromodel.signals import Record, read_signals
 
 # Outcomes that are told where none is named, if a mission has them.
 USUAL = ("rate", "angle", "peak", "bias_temperature", "attitude", "position")
-# Longer missions and tests are averaged to so many rows.
+# Longer missions and tests are averaged to so many rows; those that are navigated sooner.
 LONGEST = 200_000
 # Temperatures (°C) at which the bias is taken for its temperature sensitivity, apart by so much, and the room's.
 TEMPERATURE_STEP, ROOM = 1.0, 25.0
@@ -211,7 +211,8 @@ def read_mission(campaign: Campaign, models: tuple[GyroModel, ...]) -> tuple[Mis
     Raises:
         ModelError: a model needs a column that the mission lacks, or that is of another unit.
     """
-    averaged, together = average(with_known_output(campaign), LONGEST)
+    most = MAXIMUM_ROWS if "latitude_deg" in campaign.metadata else LONGEST
+    averaged, together = average(with_known_output(campaign), most)
     record = read_signals(averaged)
     models = tuple(model.prepared(record.signals) for model in models)
     for model in models:

@@ -68,14 +68,14 @@ class TestPlan(NamedTuple):
 
 
 class PlanChoice(NamedTuple):
-    """The best plan beside the usual one, each part in turn.
+    """The best plan beside one that does each part as often.
 
     Args:
         criterion: what was made best.
         best: that plan.
-        equal: each part as often, for as long, whatever their order.
+        equal: each part as often, for as long as the best plan takes, in shares of a part.
         gain: how many times narrower intervals are by the best plan, in the sense of the criterion; of a
-            discrimination how many times larger the separation is.
+            discrimination how many times larger the separation is. Below one where only shares of parts do better.
     """
 
     criterion: Criterion
@@ -200,7 +200,7 @@ def best_plan(
         times = {part.name: k.item() for part, k in zip(parts, n, strict=True) if k}
         return TestPlan(times, float(n @ durations), covariance, apart)
 
-    equal = np.full(len(parts), budget / durations.sum())
+    equal = np.full(len(parts), best @ durations / durations.sum())
     after, before = (float(score(np.tensordot(n, told, 1)[None])[0]) for n in (best, equal))
     if criterion == "discrimination" and after <= np.log(LEAST):
         raise ModelError(f"no plan of these candidates tells {' and '.join(rivals)} apart: add another part")
