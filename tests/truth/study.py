@@ -100,6 +100,7 @@ def run_engine(
         mutant: what to switch off in the engine.
     """
     import gyromodel
+    from gyromodel.estimate import EstimateError
     from gyromodel.units import factor, internal_unit
 
     campaign = gyromodel.Campaign(columns=built.columns, units=built.units, metadata=built.metadata)
@@ -114,8 +115,11 @@ def run_engine(
         sizes[cause.effect] = (low * scale, high * scale)
     adequate = None
     if after and found.verdict in ("named", "ambiguous"):
-        again = gyromodel.diagnose(campaign, found.extended.model_as_given(), hold_out=False)
-        adequate = again.verdict == "adequate"
+        try:
+            again = gyromodel.diagnose(campaign, found.extended.model_as_given(), hold_out=False)
+            adequate = again.verdict == "adequate"
+        except EstimateError:  # what was found cannot be fitted anew
+            adequate = False
     driver = tuple(found.driver.column.split(" and ")) if found.driver else ()
     first = (c.statistic for r in found.rounds[:1] for c in r.ranking if c.effect != "outliers")
     measured = found.gain
