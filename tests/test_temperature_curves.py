@@ -9,6 +9,7 @@ import pytest
 
 import gyromodel as gm
 from gyromodel.campaign import Campaign
+from tests.truth import study
 
 # Standard uncertainties that no draw of a hundred thousand exceeds.
 FAR = 5.0
@@ -122,3 +123,13 @@ def test_the_rate_of_a_place_that_lags_by_one_time_constant_is_the_difference_of
     estimate = gm.fit(campaign, rate)
     row = next(r for r in estimate.table() if r.effect == "bias_temperature_rate")
     assert row.value == pytest.approx(20.0, abs=FAR * row.std + 0.1)
+
+
+def test_a_curve_that_was_found_in_slow_noise_can_be_fitted_anew():
+    """From its own values, in noise to be estimated: taken for white, the noise pulls a hinge beyond all temperatures."""
+    case = study.Case(1322578408155778, "static_cycle", "flicker_and_walk", "bias_temperature_curve", 3.0)
+    built = study.build(case)
+    measured = gm.Campaign(built.columns, built.units, built.metadata)
+    found = gm.diagnose(measured, gm.model_from_effects(["bias"]), hold_out=False).extended
+    again = gm.fit(measured, found.model_as_given())
+    assert np.asarray(again.model.vector()) == pytest.approx(np.asarray(found.model.vector()), rel=0.05)

@@ -116,8 +116,16 @@ def fit_record(
     check_enough(record, len(model.slots()))
     given = given_ratios(record, model) if ratios is None else ratios
     white = NoiseRatios(jnp.zeros(()), jnp.zeros(()))
-    estimate = _in_turns(record, model, given or start or white, given is None, markov, solver)
     shapes = not all(slot.linear for slot in model.slots())
+    try:
+        estimate = _in_turns(record, model, given or start or white, given is None, markov, solver)
+    except EstimateError:
+        if given is not None or start is not None or not shapes:
+            raise
+        # Slow noise taken for white may pull shapes to where nothing shows: begin in that beside the shapes as they are.
+        held = {(model.labels[s.effect], s.field) for s in model.slots() if not s.linear}
+        beside = _in_turns(record, replace(model, fixed=model.fixed | held), white, True, markov, solver)
+        return fit_record(record, model, start=beside.ratios, markov=markov, solver=solver, ordinary=ordinary)
     slow = any(float(r) > 0 for r in (estimate.ratios.flicker, estimate.ratios.walk, estimate.ratios.markov))
     if given is None and start is None and shapes and slow:
         try:
