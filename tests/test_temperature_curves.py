@@ -126,7 +126,7 @@ def test_the_rate_of_a_place_that_lags_by_one_time_constant_is_the_difference_of
 
 
 def test_a_curve_that_was_found_in_slow_noise_can_be_fitted_anew():
-    """From its own values, in noise to be estimated: taken for white, the noise pulls a hinge beyond all temperatures."""
+    """From its own values; taken for white, the noise pulls a hinge beyond all temperatures."""
     case = study.Case(1322578408155778, "static_cycle", "flicker_and_walk", "bias_temperature_curve", 3.0)
     built = study.build(case)
     measured = gm.Campaign(built.columns, built.units, built.metadata)

@@ -122,7 +122,7 @@ def fit_record(
     except EstimateError:
         if given is not None or start is not None or not shapes:
             raise
-        # Slow noise taken for white may pull shapes to where nothing shows: begin in that beside the shapes as they are.
+        # Slow noise taken for white may pull shapes to where nothing shows: begin in that beside shapes as they are.
         held = {(model.labels[s.effect], s.field) for s in model.slots() if not s.linear}
         beside = _in_turns(record, replace(model, fixed=model.fixed | held), white, True, markov, solver)
         return fit_record(record, model, start=beside.ratios, markov=markov, solver=solver, ordinary=ordinary)
