@@ -6,7 +6,8 @@ import numpy as np
 
 from gyromodel._checks import NUMBERED
 from gyromodel.campaign import Campaign
-from gyromodel.signals import GAP, rate_output
+from gyromodel.numerics.stretches import GAP
+from gyromodel.signals import rate_output
 from gyromodel.units import factor, from_internal, is_angle
 
 MAXIMUM_ROWS = 20_000

@@ -15,13 +15,11 @@ from jaxtyping import Array, Float
 from gyromodel._checks import MISSING_STEP, NUMBERED, CampaignError, thermometers
 from gyromodel.campaign import Campaign
 from gyromodel.effects._base import Domain
-from gyromodel.numerics.smoothing import smooth_derivative, smooth_values
 from gyromodel.numerics.state_space import Sampling
+from gyromodel.numerics.stretches import derivative_by_stretch, stretches_of, values_by_stretch
 from gyromodel.units import UnitError, convertible, factor, internal_unit, quantity
 
-# A step this many times the median one separates stretches of a record.
-GAP = 10.0
-# And one this many times the median within runs, where a run begins, is time in which the gyro was off.
+# A step this many times the median within runs, where a run begins, is time in which the gyro was off.
 OFF = 1.5
 # Longer records are padded less: the work outweighs the compiling.
 FINER_FROM = 4096
@@ -175,13 +173,6 @@ def rate_scale(stated: str, unit: str) -> float:
     raise UnitError(f"it is in [{own}]" if value else "it is zero")
 
 
-def stretches_of(time: np.ndarray) -> np.ndarray:
-    """The number of each sample's stretch between gaps, from 0."""
-    step = np.diff(time)
-    typical = np.median(step)
-    return np.concatenate([[0], np.cumsum(step > GAP * typical)]).astype(int)
-
-
 def _blocks(campaign: Campaign, time: np.ndarray) -> tuple[np.ndarray, str]:
     """Stretches that replicate the driver: runs between gaps, else the segment or run column, else equal parts."""
     stretches = stretches_of(time)
@@ -224,7 +215,7 @@ def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
         columns["time"] = time - time[0]
         columns["time_on"] = _time_on(campaign, time)
         for name in thermometers(names):
-            columns[f"{name}_rate"] = _thermometer_rate(time, columns[name])
+            columns[f"{name}_rate"] = derivative_by_stretch(time, columns[name])
         if len(campaigns) > 1 and "campaign" not in names:
             columns["campaign"] = np.full(len(time), 1.0 + len(blocks))
         columns["output"] = output
@@ -312,7 +303,7 @@ def _time_on(campaign: Campaign, time: np.ndarray) -> np.ndarray:
 
 def thermometer_rate(record: Record, temperature: np.ndarray) -> np.ndarray:
     """The signal temperature_rate that a record would have with another temperature, one value a row."""
-    return _by_run(record, temperature, _thermometer_rate)
+    return _by_run(record, temperature, derivative_by_stretch)
 
 
 def with_smooth_thermometers(record: Record) -> Record:
@@ -323,7 +314,7 @@ def with_smooth_thermometers(record: Record) -> Record:
     signals = dict(record.signals)
     for name in thermometers(signals):
         measured = np.asarray(signals[name])
-        smooth = _by_run(record, measured[: record.rows], _smooth_thermometer)
+        smooth = _by_run(record, measured[: record.rows], values_by_stretch)
         signals[name] = jnp.asarray(np.pad(smooth, (0, len(measured) - record.rows), mode="edge"))
     return record._replace(signals=signals)
 
@@ -333,38 +324,6 @@ def _by_run(record: Record, values: np.ndarray, of: Callable[[np.ndarray, np.nda
     time = np.asarray(record.signals["time"])[: record.rows]
     runs = np.cumsum(np.asarray(record.sampling.restart)[: record.rows])
     return np.concatenate([of(time[runs == i], values[runs == i]) for i in np.unique(runs)])
-
-
-def _thermometer_rate(time: np.ndarray, temperature: np.ndarray) -> np.ndarray:
-    """dT/dt of the smoothed thermometer, each stretch by itself; a sample alone takes the slope to its neighbours."""
-    good = np.isfinite(temperature)
-    rate = np.full(len(time), np.nan)
-    if good.sum() < 2:
-        return rate
-    rate[good] = np.gradient(temperature[good], time[good])
-    return _by_stretch(time, temperature, smooth_derivative, rate)
-
-
-def _smooth_thermometer(time: np.ndarray, temperature: np.ndarray) -> np.ndarray:
-    """The smoothed thermometer, each stretch by itself."""
-
-    def of(time: np.ndarray, values: np.ndarray) -> np.ndarray:
-        smooth = smooth_values(time, values)
-        return smooth if np.var(smooth) > np.var(values - smooth) else np.full(len(values), values.mean())
-
-    return _by_stretch(time, temperature, of, temperature.copy())
-
-
-def _by_stretch(
-    time: np.ndarray, values: np.ndarray, of: Callable[[np.ndarray, np.ndarray], np.ndarray], into: np.ndarray
-) -> np.ndarray:
-    """What `of` makes of each stretch of two known values or more, put into an array."""
-    stretch, good = stretches_of(time), np.isfinite(values)
-    for s in np.unique(stretch):
-        here = good & (stretch == s)
-        if here.sum() > 1:
-            into[here] = of(time[here], values[here])
-    return into
 
 
 def with_columns_known(record: Record) -> tuple[Record, list[str]]:

@@ -13,9 +13,10 @@ from gyromodel.attitude import refuse_navigated, with_reference_rates
 from gyromodel.averages import MEAN_OF_ATTITUDE, MOST_TURN, as_rate, average, turning
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._variance import steps_of_output, stretch_still, thermometers_still
+from gyromodel.numerics.stretches import stretches_of
 from gyromodel.platform import is_platform, vibration_record
 from gyromodel.poses import at_rest
-from gyromodel.signals import Record, read_signals, stretches_of
+from gyromodel.signals import Record, read_signals
 from gyromodel.units import convertible
 
 # What a pose tells is in its mean: within it, means over so long (s) are enough, and keep out a hand's tremor.
