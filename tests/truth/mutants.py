@@ -52,8 +52,8 @@ def _patches(name: str) -> dict[str, Any]:
         "no_whitening": {"_session.noise_grid": white_only},
         "no_projection": {"_scan.Scanner.run_many": nothing_projected},
         "no_look_elsewhere": {
-            "_scan.log_mean_of_parts": best_of_parts,
-            "_scan.log_mean_evidence": lambda t, *of: log_evidence_ratio(t.max(axis=0), *of),
+            "_one_cell.log_mean_of_parts": best_of_parts,
+            "_one_cell.log_mean_evidence": lambda t, *of: log_evidence_ratio(t.max(axis=0), *of),
         },
         "forced": forced,
         "forced_no_nesting": forced | {"_diagnose._gain": refitted},
