@@ -11,6 +11,7 @@ import itertools
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -589,21 +590,26 @@ def test_a_test_plan_is_best_for_what_was_asked(files: Path, capsys: pytest.Capt
         "from: 20 degC, to: 60", "from: 59 degC, to: 60"
     )
     (files / "warm.yaml").write_text(text, encoding="utf-8")
-    common = [files / "model.yaml", "--plan", files / "warm.yaml", "--candidates", files / "candidates.yaml"]
-    common += ["--budget", "4 h", "--json"]
-    found = {}
-    for more in ((), ("--outcome", "rate"), ("--outcome", "attitude", "--outcome", "rate"), ("--rival", "bias_drift")):
-        status = run(*common, *more)
-        said = capsys.readouterr()
-        found[more] = json.loads(said.out)["plan"] if status == 0 else said.err
-    plain, rate, attitude, rivals = found.values()
-    assert "two rival effects" in rivals
+    (files / "exact.yaml").write_text(text.replace("instruments", "# instruments"), encoding="utf-8")
+    more = ["--candidates", files / "candidates.yaml", "--budget", "4 h", "--json"]
+
+    def plan(mission: str, *asked: str) -> dict[str, Any]:
+        assert run(files / "model.yaml", "--plan", files / mission, *more, *asked) == 0
+        return json.loads(capsys.readouterr().out)["plan"]
+
+    plain, rate = plan("exact.yaml"), plan("exact.yaml", "--outcome", "rate")
+    attitude = plan("exact.yaml", "--outcome", "attitude", "--outcome", "rate")
     assert (plain["criterion"], rate["criterion"], rate["outcome"], attitude["outcome"]) == (
         "parameters", "outcome", "rate", "attitude"
     )  # fmt: skip
     # All of the mission is warm: so are the parts that serve it, where parameters want both ends.
-    assert plain["best"]["times"]["cold"] > rate["best"]["times"].get("cold", 0)
+    assert {*plain["best"]["times"]} == {"cold", "warm"}
+    assert {*rate["best"]["times"]} == {"warm"}
     assert attitude["best"]["times"] == rate["best"]["times"]
+    # A thermometer that errs in all parts alike is told by the cold end, from the calibration there.
+    assert {*plan("warm.yaml", "--outcome", "rate")["best"]["times"]} == {"cold", "warm"}
+    assert run(files / "model.yaml", "--plan", files / "warm.yaml", *more, "--rival", "bias_drift") != 0
+    assert "two rival effects" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
