@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import random
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 from scipy.stats import binomtest
 
+from benchmarks._discovery_figures import draw_confusion, draw_power
 from benchmarks._kept import Kept, code
 from tests.truth import levels, study
-from tests.truth.campaigns import HOMES, MOTION, TESTABLE, known
-from tests.truth.verdicts import allowed
+from tests.truth.campaigns import HOMES, MOTION, TESTABLE
+from tests.truth.verdicts import Score, allowed
 
 # In multiples of the minimal detectable size.
 SIZES = (0.5, 1.0, 2.0, 3.0, 10.0)
@@ -100,6 +97,14 @@ def write_page(output: Path, whole: list[Kept]) -> None:
         *HEAD,
         *checks,
         "",
+        "## With nothing hidden, by design and noise",
+        "",
+        *_false_extensions(nulls + outside),
+        "",
+        "## More evidence than the threshold",
+        "",
+        *_thresholds(nulls + outside, sized[1.0], sized[3.0], parts["inseparable"]),
+        "",
         "## Other methods on the same campaigns",
         "",
         *controls,
@@ -123,9 +128,9 @@ def write_page(output: Path, whole: list[Kept]) -> None:
     ]  # fmt: skip
     output.parent.mkdir(parents=True, exist_ok=True)
     output.write_text("\n".join(lines), encoding="utf-8")
-    _confusion(sized[3.0] + unknown[3.0], figures["confusion"])
+    draw_confusion(sized[3.0] + unknown[3.0], figures["confusion"])
     p_values = np.array([r.answer.p_value for r in parts["calibrated"] if r.answer])
-    _curves([r for records in sized.values() for r in records], p_values, figures["power"])
+    draw_power([r for records in sized.values() for r in records], p_values, figures["power"])
 
 
 def _row(v: levels.Level) -> str:
@@ -139,6 +144,44 @@ def _row(v: levels.Level) -> str:
 
 def _check(row: str, measure: str, must: str, measured: str, count: int, met: Any) -> str:
     return f"| {row} | {measure} | – | {must} | {measured} | {count} | {'met' if met else '**missed**'} | |"
+
+
+def _false_extensions(nulls: list[study.Record]) -> list[str]:
+    """How often something is said where nothing is hidden: pooled noises hide which designs are worse."""
+    kinds = {"noise with a walk": True, "noise without": False}
+    lines = ["| design | " + " | ".join(kinds) + " |", "|---|---|---|"]
+    for design in dict.fromkeys(r.case.design for r in nulls):
+        cells = []
+        for walk in kinds.values():
+            of = [r.score for r in nulls if r.case.design == design and ("walk" in r.case.noise) == walk if r.score]
+            cells.append(f"{sum(s.detected for s in of)} of {len(of)}")
+        lines.append(f"| {design} | {' | '.join(cells)} |")
+    return lines
+
+
+def _thresholds(
+    nulls: list[study.Record], one: list[study.Record], three: list[study.Record], inseparable: list[study.Record]
+) -> list[str]:
+    """Rows 1, 5, 6 and 12 if what comes first needed more than it does: what a higher threshold would win and lose."""
+    measures: dict[str, tuple[list[study.Record], Callable[[Score, str], bool]]] = {
+        "something said, nothing hidden": (nulls, lambda score, verdict: score.detected),
+        "named, isolable, not slow in time, 1×": (levels.alone(one), lambda score, verdict: score.named),
+        "firm and wrong, 3×": (three, lambda score, verdict: score.firm_and_wrong),
+        "cannot separate: ambiguous with the truth": (
+            inseparable, lambda score, verdict: score.right and verdict == "ambiguous",
+        ),
+    }  # fmt: skip
+    head = [f"{measure} (n = {len(records)})" for measure, (records, _) in measures.items()]
+    lines = [f"| nats more | {' | '.join(head)} |", "|---|" + "---|" * len(measures)]
+    for more in (0.0, 0.25, 0.5, 1.0, 2.0):
+        shares = []
+        for records, flag in measures.values():
+            said = [(r.score, r.answer) for r in records if r.score and r.answer]
+            shares.append(
+                np.mean([flag(score, answer.verdict) and (not more or answer.margin >= more) for score, answer in said])
+            )
+        lines.append(f"| {more:g} | {' | '.join(f'{100 * share:.1f} %' for share in shares)} |")
+    return lines
 
 
 def _right(name: str, record: study.Record) -> bool:
@@ -279,60 +322,6 @@ def _never_hidden() -> list[str]:
     return sorted({e for e, of in declarations().items() if of.domain == "gyro"} - hidden - {"bias_column"})
 
 
-def _curves(records: list[study.Record], p_values: np.ndarray, path: Path) -> None:
-    """Power over size by noise, and the p-values of campaigns with nothing hidden."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
-    sizes = sorted({r.case.times_mde for r in records})
-    for noise in sorted({r.case.noise for r in records}):
-        shares = []
-        for size in sizes:
-            group = [r for r in records if r.case.times_mde == size and r.case.noise == noise and r.isolable]
-            shares.append(levels.Level("", "", "", 0.0, True, sum(r.score.named for r in group if r.score), len(group)))
-        middle = np.array([v.share for v in shares])
-        low, high = (np.array([v.interval[i] for v in shares]) for i in (0, 1))
-        shift = 1.0 + 0.02 * len(left.containers)
-        left.errorbar(
-            np.array(sizes) * shift,
-            middle,
-            [middle - low, high - middle],
-            marker="o",
-            capsize=2,
-            label=noise.replace("_", " "),
-        )
-    left.set(
-        xscale="log",
-        xlabel="size, in minimal detectable sizes",
-        ylabel="share named, isolable campaigns",
-        ylim=(0, 1.03),
-    )
-    left.set_xticks(sizes, [f"{size:g}" for size in sizes], minor=False)
-    left.minorticks_off()
-    left.legend(title="noise")
-    p = np.sort(p_values)
-    right.plot([0, 1], [0, 1], color="0.7", label="uniform")
-    right.step(
-        np.concatenate([[0.0], p, [1.0]]),
-        np.concatenate([np.arange(len(p) + 1) / len(p), [1.0]]),
-        where="post",
-        label="nothing hidden",
-    )
-    right.set(xlabel="p-value of the campaign", ylabel="share of campaigns at or below")
-    right.legend()
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
-
-
-def _said(record: study.Record) -> str:
-    answer = record.answer
-    if answer is None:
-        return "–"
-    return (
-        "+".join(answer.causes)
-        if answer.verdict == "named" and len(answer.causes) == 1
-        else ("several named" if answer.verdict == "named" else answer.verdict)
-    )
-
-
 def _missed(records: list[study.Record]) -> list[str]:
     """Every campaign of some that was not answered right, to draw it again."""
     wrong = [r for r in records if r.score and r.answer and not r.score.right]
@@ -349,28 +338,3 @@ def _missed(records: list[study.Record]) -> list[str]:
             f"| {r.case.seed} | {r.case.design} | {r.case.noise} | {r.case.effect or '–'} | {isolable} | {said} |"
         )
     return [*lines, ""]
-
-
-def _confusion(records: list[study.Record], path: Path) -> None:
-    """Truth against what was said, share of each row."""
-    verdicts = ["several named", "ambiguous", "unknown", "adequate"]
-    truths = sorted({str(r.case.effect) for r in records}, key=lambda e: (not known(e), e))
-    said = [t for t in truths if known(t)]
-    said += sorted({_said(r) for r in records} - set(said) - set(verdicts)) + verdicts
-    table = np.zeros((len(truths), len(said)))
-    for r in records:
-        table[truths.index(str(r.case.effect)), said.index(_said(r))] += 1
-    share = table / table.sum(1, keepdims=True)
-    figure, axes = plt.subplots(figsize=(0.42 * len(said) + 3, 0.34 * len(truths) + 3), layout="constrained")
-    image = axes.imshow(share, cmap="Blues", vmin=0, vmax=1)
-    for (i, j), value in np.ndenumerate(share):
-        if value:
-            axes.text(
-                j, i, f"{100 * value:.0f}", ha="center", va="center", fontsize=7, color="w" if value > 0.5 else "k"
-            )
-    axes.set_xticks(range(len(said)), [s.replace("_", " ") for s in said], rotation=90)
-    axes.set_yticks(range(len(truths)), [t.replace("_", " ") for t in truths])
-    axes.set(xlabel="the diagnosis says", ylabel="hidden, 3 × minimal detectable size")
-    figure.colorbar(image, label="share of campaigns", shrink=0.6)
-    figure.savefig(path, dpi=130)
-    plt.close(figure)

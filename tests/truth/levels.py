@@ -134,14 +134,14 @@ def oracle_right(record: Record) -> bool:
 
 def oracle_names(records: list[Record]) -> tuple[int, int]:
     """What bounds row 5: campaigns where the oracle's name is right and firm, and of how many."""
-    alone = _alone(records)
-    return sum(r.oracle_firm and oracle_right(r) for r in alone), len(alone)
+    group = alone(records)
+    return sum(r.oracle_firm and oracle_right(r) for r in group), len(group)
 
 
 def told_first(records: list[Record]) -> tuple[int, int]:
     """Row 5 with rivals beside: campaigns where something is told of and the right name comes first; of how many."""
-    alone = [r.score for r in _alone(records) if r.score]
-    return sum(s.detected and s.first_right for s in alone), len(alone)
+    scores = _scores(alone(records))
+    return sum(s.detected and s.first_right for s in scores), len(scores)
 
 
 def surpassed(records: list[Record]) -> tuple[int, int]:
@@ -152,10 +152,11 @@ def surpassed(records: list[Record]) -> tuple[int, int]:
 
 def _contested(records: list[Record]) -> list[Record]:
     """Isolable campaigns of effects that noise does not imitate, where the oracle has more than one name."""
-    return [r for r in _alone(records) if len(TESTABLE[r.case.design]) > 1]
+    return [r for r in alone(records) if len(TESTABLE[r.case.design]) > 1]
 
 
-def _alone(records: list[Record]) -> list[Record]:
+def alone(records: list[Record]) -> list[Record]:
+    """Isolable campaigns of effects that noise does not imitate: those of row 5."""
     return [r for r in records if r.isolable and r.case.effect not in SLOW]
 
 
@@ -177,7 +178,7 @@ def effect_levels(records: list[Record]) -> list[Level]:
                 _level("4", f"first name right ÷ oracle ({_mean(knew):.3f}), {at}", ".97-1", must, True, found)
             )
         if size in _ROW5:
-            named = [s.named for s in _scores(_alone(group))]
+            named = [s.named for s in _scores(alone(group))]
             measure = f"detected and named, isolable, not slow in time, {at}"
             levels.append(_level("5", measure, ".56-.76/.92-.99/1", _ROW5[size], True, named))
         if size == 3.0:
