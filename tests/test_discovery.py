@@ -127,9 +127,9 @@ def test_sizes_said_to_be_detectable_are_found(seed):
             output = built.columns["output"] + part * hidden * factor("rad/s", built.units["output"])
             held = gm.Campaign(columns=built.columns | {"output": output}, units=built.units, metadata=built.metadata)
             shown[part] += gm.diagnose(held, model, hold_out=False).verdict != "adequate"
-    assert count >= 25
-    assert binom.cdf(shown[1.0], count, 0.8) > levels.TAIL, f"seed {seed}: {shown} of {count}"
-    assert binom.cdf(shown[0.5], count, 0.8) < levels.TAIL, f"seed {seed}: {shown} of {count}"
+    assert count >= 20
+    assert binom.cdf(shown[1.0], count, 0.8) > 1e-4, f"seed {seed}: {shown} of {count}"
+    assert binom.cdf(shown[0.5], count, 0.8) < 1e-4, f"seed {seed}: {shown} of {count}"
 
 
 def test_what_a_study_keeps_on_disk_comes_to_the_same_levels(tmp_path):

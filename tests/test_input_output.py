@@ -65,14 +65,18 @@ def test_uncertainty_is_the_spread_of_curves_through_other_points(rng: np.random
 @pytest.mark.parametrize("known", [True, False])
 def test_smoothing_averages_the_scatter_of_the_points(known: bool, rng: np.random.Generator) -> None:
     """With the scatter known the points, eight readings each, are as good as a few more; estimated from forty rates."""
-    count = COUNT if known else 40
-    rates, std = np.deg2rad(np.linspace(-100, 120, count)), 0.5 * rng.uniform(0.5, 2.0, count) ** known
-    output = 1000 * rates + 2 + std * rng.normal(size=count)
-    curve = InputOutputCurve.smoothed(jnp.asarray(rates), jnp.asarray(output), jnp.asarray(std) if known else None)
-    error, claimed = np.asarray(curve.spline.values) - (1000 * rates + 2), np.asarray(curve.covariance)
-    # A mean square of correlated errors spreads no more than one square does; Student's where the scatter is estimated.
-    assert np.mean(error**2) < stats.f.isf(1e-5, 1, 1e9 if known else count / 2) * np.trace(claimed) / count
-    assert np.trace(claimed) < 0.7 * np.sum(std**2)
+    count, draws, square = COUNT if known else 40, 60, 0.0
+    rates = np.deg2rad(np.linspace(-100, 120, count))
+    for _ in range(draws):
+        std = 0.5 * rng.uniform(0.5, 2.0, count) ** known
+        output = 1000 * rates + 2 + std * rng.normal(size=count)
+        curve = InputOutputCurve.smoothed(jnp.asarray(rates), jnp.asarray(output), jnp.asarray(std) if known else None)
+        error, claimed = np.asarray(curve.spline.values) - (1000 * rates + 2), np.asarray(curve.covariance)
+        k = rng.integers(count)
+        square += error[k] ** 2 / claimed[k, k]
+        assert np.trace(claimed) < 0.7 * np.sum(std**2)
+    # One point of each curve; where the scatter is estimated its own error adds a little.
+    assert stats.chi2.ppf(1e-5, draws) < square < (1.0 if known else 1.3) * stats.chi2.isf(1e-5, draws)
 
 
 def test_few_points_do_not_tell_their_own_scatter() -> None:

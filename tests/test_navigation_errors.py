@@ -50,7 +50,6 @@ def gyros() -> list[Estimate]:
     return [fitted(rng, bias) for bias in (0.0, 0.0, 5.0)]
 
 
-@pytest.mark.long
 def test_a_bias_about_east_tilts_and_runs_north(gyros: list[Estimate]):
     """The platform drifts by minus what its gyro shows at rest, b: Schuler oscillation of the tilt, b sin(ω t)/ω."""
     made = navigation_error(gyros, [mission(20.0)] * 3, START, at_rest(), STEP, EVERY).errors.value

@@ -65,17 +65,19 @@ def test_a_hinge_is_continuous_and_finds_the_bend():
 
 
 def test_intervals_of_breakpoints_cover(rng: np.random.Generator):
-    count, inside = 20, 0
+    count, inside, widths = 100, 0, []
     for _ in range(count):
         low, high = fit_temperature_model({"SF": bent(rng)["SF"]}, SOAKS, "hinge").breakpoint_interval[0, 0]
         inside += low <= BREAK <= high
+        widths.append(high - low)
     # The likelihood ratio is chi-squared only for many soaks: 90 % is asked for.
     assert inside >= binom.ppf(1e-5, count, 0.90)
+    assert np.median(widths) < 30.0
 
 
 def test_a_sharp_bend_has_a_narrow_interval_that_covers(rng: np.random.Generator):
     """Narrower than the soaks are apart by hundreds: an interval must not end with the grid that finds it."""
-    count, inside, widths = 20, 0, []
+    count, inside, widths = 100, 0, []
     for _ in range(count):
         y = 1.0 + 0.01 * SOAKS - 0.02 * np.maximum(SOAKS - 3.7, 0.0) + 1e-3 * rng.standard_normal(11)
         model = fit_temperature_model({"SF": y}, SOAKS, "hinge")

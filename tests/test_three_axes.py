@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from scipy.stats import binom
+from scipy.stats import chi2
 
 from gyromodel import _diagnose_files, cli
 from gyromodel._checks import CampaignError
@@ -85,9 +85,12 @@ def test_a_lean_wants_all_three_axes_turned(rng: np.random.Generator):
 @pytest.mark.law
 @pytest.mark.long
 def test_axes_as_they_should_be_say_so(rng: np.random.Generator):
-    """A true triad is called turned, or not square, once in a thousand each."""
-    claimed = [t.turned + t.oblique for t in (lie(np.eye(3), rng) for _ in range(8))]
-    assert binom.sf(sum(claimed) - 1, 16, 1e-3) > 1e-4
+    """A true triad is called turned, or not square, once in a thousand each: its errors have the law they claim."""
+    found = [lie(np.eye(3), rng) for _ in range(8)]
+    assert sum(t.turned + t.oblique for t in found) <= 1
+    for angles in ("rotation", "squareness"):
+        each = [(getattr(t, angles), getattr(t, f"{angles}_covariance")) for t in found]
+        assert 1e-5 < chi2.cdf(sum(a @ np.linalg.solve(c, a) for a, c in each), 3 * len(each)) < 1 - 1e-5
 
 
 @pytest.mark.long

@@ -88,6 +88,8 @@ def test_intervals_cover_with_the_thermometry_carried_through(rng: np.random.Gen
     assert (inside[1:] >= binom.ppf(1e-4 / 16, count, 0.93)).all(), inside / count
     square = np.mean((error / std) ** 2, axis=1)
     assert square[0] > 1.5 * square[1:].max(), "the naive fit takes the thermometer for exact"
+    for k in (1, 2):
+        assert 1e-5 < chi2.cdf(count * square[k], count) < 1 - 1e-5
 
 
 def test_a_joint_fit_of_a_continuous_thermistor_keeps_it_continuous(rng: np.random.Generator):
