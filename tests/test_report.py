@@ -16,6 +16,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -25,22 +26,30 @@ from hypothesis import strategies as st
 
 from gyromodel.campaign import Campaign
 from gyromodel.declarations import declarations
+from gyromodel.diagnosis._data import read as search_data
 from gyromodel.diagnosis._result import Candidate, Cause, Confuser, Diagnosis, Driver, Gain, ParameterValue, Round
 from gyromodel.estimate import Estimate
 from gyromodel.estimate._estimate import ParameterRow
-from gyromodel.report import sentence, with_uncertainty, write_report
-from gyromodel.report._numbers import number, pair, percent, unit_text
+from gyromodel.report import history_figure, sentence, with_uncertainty, write_report
+from gyromodel.report._figures import _column, figures
+from gyromodel.report._numbers import number, pair, percent, stated, unit_text
+from gyromodel.report._page import context
 from gyromodel.report._series import abscissae, bins, explained, thinned
 from gyromodel.report._words import PHRASES
+from gyromodel.study._sensitivity import History, Sensitivity
 
 Make = Callable[..., Diagnosis]
 
 
 class Fitted(Estimate):
-    """Stands in for a fitted model, with its table only."""
+    """Stands in for a fitted model, with its table, its model's kind and its record only."""
 
-    def __init__(self, rows: tuple[tuple[str, str, float, float, str], ...]) -> None:
+    def __init__(
+        self, rows: tuple[tuple[str, str, float, float, str], ...], domain: str = "gyro", record: Any = None
+    ) -> None:
         object.__setattr__(self, "rows", tuple(ParameterRow(*row) for row in rows))
+        object.__setattr__(self, "model", SimpleNamespace(domain=domain))
+        object.__setattr__(self, "record", record)
 
     def table(self) -> tuple[ParameterRow, ...]:
         return self.rows  # type: ignore[attr-defined]
@@ -615,11 +624,255 @@ def test_a_sentence_needs_neither_drawing_nor_models():
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"
 
 
+def words(report: Path) -> str:
+    """The text of a page, in one line."""
+    return re.sub(r"\s+", " ", "".join(read(report).text))
+
+
+def panels(diagnosis: Diagnosis) -> list[tuple[str, bool]]:
+    """The residual panels in order, and whether each is marked as what the error follows."""
+    return [(panel.name, panel.cause) for panel in figures(diagnosis).residuals]
+
+
 def test_a_pair_of_columns_is_a_driver_too(rng: np.random.Generator, tmp_path: Path):
     diagnosis = unknown(rng)
     assert diagnosis.driver is not None
-    grid = np.zeros((4, 4))
-    pair_of = Driver("rate, temperature", "", grid, grid, grid, "deg/s")
-    diagnosis = replace(diagnosis, driver=pair_of)
+    pair_of = replace(diagnosis.driver, column="rate and temperature", unit="deg/s", x=np.linspace(-150.0, 150.0, 80))
+    diagnosis = replace(diagnosis, driver=pair_of, unexplained={"rate and d(rate)/dt": 0.3})
     assert "follows rate and temperature and matches nothing" in sentence(diagnosis)
-    assert "driver" not in [path.stem for path in write_report(diagnosis, tmp_path)]
+    assert panels(diagnosis)[:2] == [("residual-temperature", True), ("residual-rate", True)]
+    [drawn] = figures(diagnosis).driver
+    assert "depends on more than rate," in drawn.caption
+    assert "Rate and angular acceleration" in words(write_report(diagnosis, tmp_path)[0])
+    turning = replace(diagnosis, driver=replace(pair_of, column="rate and d(rate)/dt"))
+    assert "follows rate and angular acceleration and matches" in sentence(turning)
+    assert {name for name, followed in panels(turning) if followed} == {"residual-rate", "residual-rate-rate"}
+
+
+def test_a_column_whose_name_has_an_and_in_it_is_no_pair(rng: np.random.Generator):
+    diagnosis = unknown(rng)
+    assert diagnosis.driver is not None
+    campaign = diagnosis.campaign.with_column("heat and cold", diagnosis.campaign.columns["temperature"], "degC")
+    alone = replace(diagnosis, campaign=campaign, driver=replace(diagnosis.driver, column="heat and cold"))
+    assert panels(alone)[0] == ("residual-heat-and-cold", True)
+    [drawn] = figures(alone).driver
+    assert drawn.caption.startswith("Line")
+    assert "Squares" in drawn.caption
+    both = replace(alone, driver=replace(diagnosis.driver, column="rate and heat and cold"))
+    assert {name for name, followed in panels(both) if followed} == {"residual-rate", "residual-heat-and-cold"}
+
+
+def test_over_time_residuals_lie_on_the_curve_that_was_found(rng: np.random.Generator):
+    """The curve is of the time in each campaign, wherever the clock of its file began."""
+    parts = [rate_table(rng) for _ in range(2)]
+    parts = [c.with_column("time", c.columns["time"] + 5e4 * (i + 1), "s") for i, c in enumerate(parts)]
+    data = search_data(parts)
+    since = np.concatenate([c.columns["time"] - c.columns["time"][0] for c in parts])
+    x = np.linspace(0.0, since.max(), 80)
+    driver = Driver("time", "s", x, 1e-3 * np.sin(x / 900.0), np.full(80, 3e-5), "deg/s")
+    base = made(data.whole, 1e-3 * np.sin(since / 900.0), 1.1e-4, rng)
+    extended = Fitted(GIVEN, record=data.record)
+    diagnosis = replace(base, verdict="unknown", causes=(), driver=driver, extended=extended)
+    at = _column(diagnosis, {})
+    assert at is not None
+    assert at == pytest.approx(since)
+    means = bins(at, diagnosis.residual_before)
+    assert means.mean == pytest.approx(np.interp(means.x, driver.x, driver.y) - driver.y.mean(), abs=2e-4)
+    [drawn] = figures(diagnosis).driver
+    assert "Squares" in drawn.caption
+    assert "time since the start" in drawn.svg
+
+
+def held_at(diagnosis: Diagnosis, *rows: tuple[str, str, float, float, str], **change: Any) -> Diagnosis:
+    """The diagnosis of a simulation that holds these parameters fixed, beside the scale factor it fits."""
+    return replace(diagnosis, baseline=Fitted((GIVEN[0], *rows)), **change)
+
+
+BIAS = Cause("bias", (ParameterValue("value", 5.0, 0.02, "deg/h", (4.9, 5.04)),), 90.0, 1e-30, 1e-29, 0.99)
+
+
+def test_an_effect_held_at_a_wrong_value_is_not_called_missing(rng: np.random.Generator, tmp_path: Path):
+    fixed = ("bias", "value", 4.0, 0.0, "deg/h")
+    diagnosis = held_at(named(rng), fixed, causes=(BIAS,))
+    assert sentence(diagnosis).startswith(
+        "Your simulation holds the bias at 4 deg/h, where the data say (5.000 ± 0.020) deg/h; with that the error on"
+    )
+    text = words(write_report(diagnosis, tmp_path)[0])
+    assert "Your simulation holds it at 4 deg/h." in text
+    assert "Only because it is as far off as this was it told" in text
+    assert "4.00000 deg/h (fixed)" in text
+    both = sentence(replace(diagnosis, causes=(SHUPE, BIAS)))
+    assert (
+        "lacks a temperature-rate bias of (0.0981 ± 0.0030) deg/s per °C/s, and holds the bias at 4 deg/h, where"
+        in both
+    )
+    assert "; with them the error" in both
+    fitted = replace(diagnosis, baseline=Fitted(GIVEN))
+    assert sentence(fitted).startswith("Your simulation lacks a constant bias of (5.000 ± 0.020) deg/h; with it")
+    assert "holds it at" not in words(write_report(fitted, tmp_path)[0])
+
+
+@pytest.mark.parametrize(
+    ("unit", "before", "value", "std", "text"),
+    [
+        ("1", 0.98, 0.98102, 2e-5, "the scale factor at 0.98, where the data say 0.981020 ± 0.000020;"),
+        (
+            "count/deg",
+            1000.0,
+            1001.2,
+            0.02,
+            "the scale factor at 1000 count/deg, where the data say (1001.200 ± 0.020)",
+        ),
+    ],
+)
+def test_a_scale_factor_held_at_a_wrong_value_is_told_beside_it(
+    unit: str, before: float, value: float, std: float, text: str, rng: np.random.Generator
+):
+    cause = replace(BIAS, effect="scale_factor", parameters=(ParameterValue("value", value, std, unit),))
+    rows = (("scale_factor", "value", before, 0.0, unit),)
+    diagnosis = replace(named(rng), causes=(cause,), baseline=Fitted(rows))
+    assert f"Your simulation holds {text}" in sentence(diagnosis)
+    missing = sentence(replace(diagnosis, baseline=Fitted(())))
+    said = "a scale-factor error of (-18980 ± 20) ppm" if unit == "1" else "a scale factor of (1001.200 ± 0.020)"
+    assert f"Your simulation lacks {said}" in missing
+
+
+def test_several_held_values_are_told_by_name_and_many_are_not(rng: np.random.Generator):
+    rows = (
+        ("bias_periodic", "cosine", 0.5, 0.0, "deg/h"),
+        ("bias_periodic", "sine", 0.0, 0.0, "deg/h"),
+        ("bias_periodic", "frequency", 0.0004, 0.0, "Hz"),
+        ("bias_temperature_curve", "coefficient[0]", 1.0, 0.0, "deg/h"),
+    )
+    curve = replace(SHUPE, effect="bias_temperature_curve", parameters=(ParameterValue("slope[0]", 2.0, 0.1, "deg/h"),))
+    diagnosis = held_at(named(rng), *rows, causes=(PERIODIC, curve))
+    assert (
+        "holds the periodic bias at cosine 0.5 deg/h, sine 0 deg/h and frequency 4e-4 Hz, where the data say cosine "
+        "(0.610 ± 0.080) deg/h, sine (-0.221 ± 0.079) deg/h and frequency (4.120 ± 0.020)e-4 Hz, and the bias that "
+        "curves with temperature at values that the data contradict; with these the error"
+    ) in sentence(diagnosis)
+
+
+def test_held_values_are_told_with_other_verdicts_too(rng: np.random.Generator):
+    fixed = ("bias", "value", 4.0, 0.0, "deg/h")
+    part = held_at(unknown(rng), fixed, causes=(BIAS,))
+    assert "though the bias at (5.000 ± 0.020) deg/h instead of 4 deg/h would take up part of it" in sentence(part)
+    doubtful = ambiguous(rng, 2000)
+    share = {"bias": 0.5, "bias_drift": 0.4}
+    alike = held_at(doubtful, fixed, causes=(BIAS, doubtful.causes[0]), credible_set=share)
+    assert "a constant bias other than the simulation's or a bias drift in time" in sentence(alike)
+    sure = held_at(doubtful, fixed, causes=(BIAS, *doubtful.causes))
+    assert sentence(sure).startswith("Your simulation holds the bias at 4 deg/h, where the data say (5.000 ± 0.020)")
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [
+        (4.0 * (1.0 + 1e-15), "deg/h", "4 deg/h"),
+        (1000.012, "count/deg", "1000.012 count/deg"),
+        (-3e-6, "", "-3e-6"),
+        (0.0, "deg/h", "0 deg/h"),
+        (150000.0, "count", "1.5e5 count"),
+        (1.0 / 3.0, "V", "0.3333333333 V"),
+    ],
+)
+def test_stated_values_are_told_in_the_digits_they_have(value: float, unit: str, text: str):
+    assert stated(value, unit) == text
+
+
+def found_of(diagnosis: Diagnosis) -> dict[str, str]:
+    """What the table of searched names says was found of each."""
+    return {row["title"]: row["found"] for row in context(diagnosis)["searched"]}
+
+
+def test_what_was_searched_says_what_was_found_of_each(rng: np.random.Generator, tmp_path: Path):
+    names = (*SEARCHED, "scale_factor", "bias", "smooth(temperature)", "smooth(rate, d(rate)/dt)")
+    diagnosis = replace(unknown(rng), searched=names)
+    found = found_of(diagnosis)
+    assert found["Some smooth function of temperature"] == "followed"
+    assert found["Some smooth function of rate and angular acceleration"] == ""
+    assert not {"Scale-factor error", "Constant bias"} & set(found)
+    assert "smooth(" not in words(write_report(diagnosis, tmp_path)[0])
+    assert diagnosis.driver is not None
+    pair_of = replace(diagnosis.driver, column="rate and d(rate)/dt")
+    found = found_of(replace(diagnosis, driver=pair_of, credible_set={"smooth(rate, d(rate)/dt)": 1.0}))
+    assert found["Some smooth function of rate and angular acceleration"] == "followed"
+    assert found["Some smooth function of temperature"] == ""
+
+
+def test_what_the_simulation_has_and_more_was_looked_for_stays_in_the_table(rng: np.random.Generator):
+    names = (*SEARCHED, "scale_factor", "bias")
+    wider = replace(named(rng), searched=names, minimum_detectable=DETECTABLE | {"scale_factor": (1.2, "ppm")})
+    assert found_of(wider)["Scale-factor error"] == ""
+    assert found_of(replace(wider, causes=(BIAS,)))["Constant bias"] == "named"
+    assert sentence(replace(adequate(rng), searched=names)).startswith(
+        "Nothing is missing that this campaign could show: 13 effects were"
+    )
+
+
+def test_what_may_be_is_possible_and_what_is_sure_is_named(rng: np.random.Generator):
+    diagnosis = ambiguous(rng, 2000)
+    share = {"bias_drift": 0.52, "bias_warmup": 0.44}
+    found = found_of(replace(diagnosis, causes=(diagnosis.causes[0], SHUPE), credible_set=share))
+    assert (found["Bias drift in time"], found["Warm-up bias"]) == ("possible", "possible")
+    assert found["Temperature-rate bias"] == "named"
+    assert found["Step of the bias"] == ""
+
+
+def test_each_step_stands_beside_its_own_value(rng: np.random.Generator):
+    first, second = (("bias_step", "size", value, 0.1, "deg/h") for value in (1.0, 2.0))
+    new = ("bias_step", "size", 7.0, 0.1, "deg/h")
+    diagnosis = replace(named(rng), baseline=Fitted((first, second)), extended=Fitted((first, second, new)))
+    rows = context(diagnosis)["parameters"]
+    assert [row["before"] for row in rows] == ["(1.00 ± 0.10) deg/h", "(2.00 ± 0.10) deg/h", "not in it"]
+    assert [row["new"] for row in rows] == [False, False, True]
+
+
+def test_a_covariate_whose_name_begins_as_the_output_is_drawn(rng: np.random.Generator):
+    diagnosis = named(rng)
+    campaign = diagnosis.campaign.with_column("output_power", rng.normal(size=430), "W")
+    names = [name for name, _ in panels(replace(diagnosis, campaign=campaign))]
+    assert "residual-output-power" in names
+    assert "residual-output" not in names
+
+
+def test_a_platform_is_not_told_of_commands_for_gyros(rng: np.random.Generator, tmp_path: Path):
+    diagnosis = named(rng)
+    assert "gyromodel compensate" in words(write_report(diagnosis, tmp_path)[0])
+    platform = replace(diagnosis, extended=Fitted(GIVEN, domain="platform"))
+    text = words(write_report(platform, tmp_path)[0])
+    assert "gyromodel diagnose CAMPAIGN --model model.yaml" in text
+    assert not re.search("gyromodel (simulate|compensate|export)|range of temperature", text)
+
+
+def test_gaps_of_the_record_are_told(rng: np.random.Generator, tmp_path: Path):
+    diagnosis = named_static(rng, 3000)
+    assert "3 000 samples with a gap of 1506 s" in words(write_report(diagnosis, tmp_path)[0])
+    rows = np.arange(3000)
+    kept = (rows < 400) | (rows >= 2200)
+    facts = lambda campaign: context(replace(diagnosis, campaign=campaign))["facts"]  # noqa: E731
+    assert facts(diagnosis.campaign.select(kept))[-1] == "1\u202f200 samples with a gap of 3.42 h"
+    twice = kept & ((rows < 2500) | (rows >= 2600))
+    assert facts(diagnosis.campaign.select(twice))[-1] == "1\u202f100 samples with 2 gaps, the longest 3.42 h"
+    assert facts(named(rng).campaign)[-1] == "430 samples"
+
+
+def test_joined_campaigns_of_other_intervals_have_no_gaps(rng: np.random.Generator):
+    fast, slow = static_log(rng, 3000).select(slice(1000)), rate_table(rng)
+    slow = slow.select(slice(200))
+    time = np.append(fast.columns["time"], fast.columns["time"][-1] + 1.0 + slow.columns["time"])
+    columns = {"time": time, "output": rng.normal(size=1200), "campaign": np.repeat([1.0, 2.0], [1000, 200])}
+    joined = Campaign(columns, {"time": "s", "output": "deg/s", "campaign": ""}, {"kind": "rate"})
+    assert context(replace(named(rng), campaign=joined))["facts"][-1] == "1\u202f200 samples"
+
+
+def test_the_history_of_three_axes_is_told_as_that_of_the_first():
+    time = np.linspace(1.0, 100.0, 50)
+    alone = {f"{axis} bias value": (axis == "x") * 1e-3 * time for axis in "xyz"}
+    svg = history_figure(Sensitivity((), History(time, 1e-3 * time, alone), (), ()))
+    assert "all of axis x, with their correlations" in svg
+    assert "angle about x, standard uncertainty" in svg
+    assert "y bias" not in svg
+    svg = history_figure(Sensitivity((), History(time, 1e-3 * time, {"bias value": 1e-3 * time}), (), ()))
+    assert "all, with their correlations" in svg
+    assert "axis x" not in svg

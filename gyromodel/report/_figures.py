@@ -11,6 +11,7 @@ import numpy as np
 from gyromodel.declarations import RATE_OF
 from gyromodel.report import _drawing as draw
 from gyromodel.report._numbers import number, percent, unit_text
+from gyromodel.report._sentence import followed
 from gyromodel.report._series import (
     POINTS,
     Abscissa,
@@ -24,7 +25,7 @@ from gyromodel.report._series import (
     time_axis,
     varies,
 )
-from gyromodel.report._words import driver_name
+from gyromodel.report._words import driven, listed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -80,8 +81,7 @@ def _figures(diagnosis: Diagnosis) -> Figures:
     drivers, left_out = abscissae(diagnosis)
     known = {a.key: a for a in drivers}
     causes = {key for cause in diagnosis.causes for key in follows(cause.effect, known)}
-    if diagnosis.driver is not None:
-        causes |= {key_of(column.strip()) for column in diagnosis.driver.column.split(",")}
+    causes |= {key_of(column) for column in followed(diagnosis)}
     moved = swept(diagnosis.campaign, diagnosis.residual_before, diagnosis.rate_unit)
     if moved:
         rate = Abscissa("rate", "input rate", diagnosis.campaign.units["rate"], diagnosis.campaign.columns["rate"])
@@ -137,7 +137,7 @@ def _deviation(diagnosis: Diagnosis, x: Abscissa) -> Drawn:
 def _output(diagnosis: Diagnosis) -> Drawn:
     """Raw output over time with both simulations."""
     campaign = diagnosis.campaign
-    column = "output" if "output" in campaign.columns else next(n for n in campaign.columns if n.startswith("output"))
+    column = campaign.outputs[0]
     unit = campaign.units.get(column, "")
     x, skip = time_axis(campaign), apart(diagnosis)
     output = np.asarray(campaign.columns[column], float)
@@ -189,9 +189,9 @@ def _residual(diagnosis: Diagnosis, x: Abscissa, name: str, cause: bool) -> Draw
 
 
 def _drawable(diagnosis: Diagnosis) -> bool:
-    """Whether there is a function of one column to draw."""
+    """Whether there is a function to draw."""
     driver = diagnosis.driver
-    return driver is not None and driver.x.ndim == 1 and bool(np.any(np.isfinite(driver.y + driver.std)))
+    return driver is not None and bool(np.any(np.isfinite(driver.y + driver.std)))
 
 
 def _found(diagnosis: Diagnosis, known: dict[str, Abscissa]) -> Drawn:
@@ -203,11 +203,11 @@ def _found(diagnosis: Diagnosis, known: dict[str, Abscissa]) -> Drawn:
     x, y, std = driver.x[order], driver.y[order], driver.std[order]
     power = draw.power_of_ten(float(np.nanmax(np.abs(y) + 2.0 * std)))
     scale = 10.0**power
-    first, *more = driver.column.split(" and ")
+    first, *more = followed(diagnosis)
     # A response depends on what the rate was before and after as well.
     if more or first == RATE_OF.format("rate"):
         axes.plot(x, y / scale, ".", color=draw.AFTER, markersize=4.0, zorder=5, label="function found")
-        caption = f"Points: the function found, which depends on more than {driver_name(first)}, where it was measured."
+        caption = f"Points: the function found, which depends on more than {driven(first)}, where it was measured."
     else:
         for width, alpha in ((2.0, 0.16), (1.0, 0.26)):
             lower, upper = (y - width * std) / scale, (y + width * std) / scale
@@ -231,8 +231,9 @@ def _found(diagnosis: Diagnosis, known: dict[str, Abscissa]) -> Drawn:
                 label="residual before",
             )
             caption += " Squares: means of the residual before, moved to the level of the curve."
-    label = driver_name(driver.column)
-    axes.set_xlabel(draw.axis_label(driver_name(first), driver.unit, 0))
+    label = listed([driven(column) for column in (first, *more)])
+    across = "time since the start" if first == "time" else driven(first)
+    axes.set_xlabel(draw.axis_label(across, driver.unit, 0))
     axes.set_ylabel(draw.axis_label("error of the simulation", driver.y_unit, power))
     draw.legend(axes, 2)
     reach = f"{number(float(np.nanmin(y)))} to {number(float(np.nanmax(y)))} {unit_text(driver.y_unit)}"
@@ -305,6 +306,9 @@ def _column(diagnosis: Diagnosis, known: dict[str, Abscissa]) -> np.ndarray | No
     """The driver's column in the driver's unit, if it was recorded or can be computed."""
     driver, campaign = diagnosis.driver, diagnosis.campaign
     assert driver is not None
+    if driver.column == "time":  # as it was searched: of each campaign from its own start
+        record = diagnosis.extended.record
+        return np.asarray(record.signals["time"])[: record.rows] * _factor("s", driver.unit)
     if driver.column in campaign.columns:
         return np.asarray(campaign.in_unit(driver.column, driver.unit), float)
     computed = known.get(key_of(driver.column))

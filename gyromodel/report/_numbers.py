@@ -74,6 +74,12 @@ def with_uncertainty(value: float, std: float, unit: str = "") -> str:
     return f"({body}){after}" if after else body
 
 
+def stated(value: float, unit: str = "") -> str:
+    """A value that was stated, in the fewest digits that tell it, up to ten."""
+    same = (d for d in range(1, 10) if math.isclose(float(f"{value:.{d - 1}e}"), value, rel_tol=1e-10))
+    return f"{number(value, next(same, 10))} {unit_text(unit)}".strip()
+
+
 def number(value: float, digits: int = 2, power: int | None = None) -> str:
     """A value to so many significant digits, e.g. "3.6e-4".
 

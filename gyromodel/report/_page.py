@@ -9,13 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gyromodel._atomic import write_text
-from gyromodel.report._numbers import count, number, pair, percent, unit_text, with_uncertainty
-from gyromodel.report._sentence import confused, kinds, sentence
+from gyromodel.report._numbers import count, number, pair, percent, stated, unit_text, with_uncertainty
+from gyromodel.report._sentence import Held, confused, followed, held, kinds, member, searched, sentence
 from gyromodel.report._template import filled
-from gyromodel.report._words import driver_name, listed, phrase, spoken, title
+from gyromodel.report._words import driver_columns, driver_name, is_driver, listed, phrase, spoken, title
 
 if TYPE_CHECKING:
+    from gyromodel.campaign import Campaign
     from gyromodel.diagnosis._result import Cause, Diagnosis, ParameterValue, Round
+    from gyromodel.estimate._calibration import ParameterRow
 
 _BADGES = {
     "adequate": "Nothing missing",
@@ -74,8 +76,8 @@ def context(diagnosis: Diagnosis) -> dict[str, Any]:
         "campaign": diagnosis.campaign.name,
         "facts": _facts(diagnosis),
         "tiles": _tiles(diagnosis),
-        "causes": [_cause(cause) for cause in diagnosis.causes],
-        "confused": [phrase(name, kind.get(name, "effect")) for name in confused(diagnosis)],
+        "causes": [_cause(cause, held(diagnosis, cause.effect)) for cause in diagnosis.causes],
+        "confused": [member(diagnosis, name, kind.get(name, "effect")) for name in confused(diagnosis)],
         "rankings": _rankings(diagnosis),
         "ladder": _ladder(diagnosis),
         "gain": _gain(diagnosis),
@@ -91,7 +93,7 @@ def context(diagnosis: Diagnosis) -> dict[str, Any]:
             for name, share in sorted(diagnosis.credible_set.items(), key=lambda item: -item[1])
         ],
         "unexplained": [
-            {"title": driver_name(name).capitalize(), "share": share}
+            {"title": driver_name(name, diagnosis.campaign.columns).capitalize(), "share": share}
             for name, share in sorted(diagnosis.unexplained.items(), key=lambda item: -item[1])
         ],
         "searched": _searched(diagnosis),
@@ -101,6 +103,7 @@ def context(diagnosis: Diagnosis) -> dict[str, Any]:
         "findings": [text[:1].upper() + text[1:] for text in diagnosis.findings],
         "next_test": diagnosis.next_test,
         "parameters": _parameters(diagnosis),
+        "platform": _of_platform(diagnosis),
         "threshold": _threshold(diagnosis),
         "rate_unit": unit_text(diagnosis.rate_unit),
     }
@@ -111,7 +114,26 @@ def _facts(diagnosis: Diagnosis) -> list[str]:
     campaign = diagnosis.campaign
     rows = len(next(iter(campaign.columns.values())))
     said = {key: campaign.metadata[key] for key in ("gyro", "serial", "test") if key in campaign.metadata}
-    return [*(f"{key} {value}" for key, value in said.items()), f"{count(rows)} samples"]
+    # The runs of a platform's log are shown one after another, with pauses that are none of its own.
+    gaps = "" if _of_platform(diagnosis) else _gaps(campaign)
+    return [*(f"{key} {value}" for key, value in said.items()), f"{count(rows)} samples{gaps}"]
+
+
+def _of_platform(diagnosis: Diagnosis) -> bool:
+    return diagnosis.extended.model.domain == "platform"
+
+
+def _gaps(campaign: Campaign) -> str:
+    """How many gaps lie between the samples, of each of several campaigns, and the longest."""
+    number_of = campaign.columns.get("campaign")
+    each = [campaign] if number_of is None else [campaign.select(number_of == k) for k in {*number_of.tolist()}]
+    lengths = [length for part in each for _, length in part.gaps()]
+    if not lengths:
+        return ""
+    longest = max(lengths)
+    size = f"{number(longest / 3600.0, 3)} h" if longest > 7200.0 else f"{number(longest, 3)} s"
+    told = f"{count(len(lengths))} gaps, the longest" if len(lengths) > 1 else "a gap of"
+    return f" with {told} {size}"
 
 
 def _tiles(diagnosis: Diagnosis) -> list[dict[str, str]]:
@@ -145,7 +167,7 @@ def _arrow(before: str, after: str) -> str:
     return f"({first} → {second})e{power}" if power and power == other else f"{before} → {after}"
 
 
-def _cause(cause: Cause) -> dict[str, Any]:
+def _cause(cause: Cause, at: Held) -> dict[str, Any]:
     return {
         "title": title(cause.effect),
         "id": cause.effect,
@@ -154,7 +176,12 @@ def _cause(cause: Cause) -> dict[str, Any]:
         "p": _small(cause.p_adjusted),
         "posterior": percent(cause.posterior),
         "parameters": [
-            {"name": spoken(p.name), "value": with_uncertainty(p.value, p.std, p.unit), "interval": _helped(p)}
+            {
+                "name": spoken(p.name),
+                "value": with_uncertainty(p.value, p.std, p.unit),
+                "held": stated(at[p.name].value, at[p.name].unit) if p.name in at else "",
+                "interval": _helped(p),
+            }
             for p in cause.parameters
         ],
         "confusers": [
@@ -294,31 +321,39 @@ def _noise_kinds(diagnosis: Diagnosis) -> str:
 
 
 def _searched(diagnosis: Diagnosis) -> list[dict[str, str]]:
-    """Each searched effect with the smallest size that would have been seen."""
-    named = {cause.effect for cause in diagnosis.causes}
+    """Each searched name with the smallest size that would have been seen, and what was found of it."""
+    doubtful = confused(diagnosis) if diagnosis.verdict == "ambiguous" else ()
+    found = dict.fromkeys([*doubtful, *diagnosis.credible_set], "possible")
+    found |= {cause.effect: "named" for cause in diagnosis.causes if cause.effect not in doubtful}
     rows = []
-    for name in dict.fromkeys([*diagnosis.searched, *diagnosis.minimum_detectable]):
+    for name in searched(diagnosis):
         size, unit = diagnosis.minimum_detectable.get(name, (math.nan, ""))
         smallest = f"{number(size)} {unit_text(unit)}".strip() if math.isfinite(size) else "–"
-        found = {"named": "named", "ambiguous": "possible"}.get(diagnosis.verdict, "named") if name in named else ""
-        rows.append({"title": title(name), "id": name, "smallest": smallest, "found": found})
+        follows = is_driver(name) and driver_columns(name) == followed(diagnosis)
+        verdict = "followed" if follows else found.get(name, "")
+        rows.append(
+            {"title": title(name), "id": "" if is_driver(name) else name, "smallest": smallest, "found": verdict}
+        )
     return rows
 
 
 def _parameters(diagnosis: Diagnosis) -> list[dict[str, str]]:
     """Every parameter of the extended model beside its value in the simulation as given."""
-    given = {}
-    if diagnosis.baseline is not None:
-        given = {(row[0], row[1]): row for row in diagnosis.baseline.table()}
+    given: dict[tuple[str, str], list[ParameterRow]] = {}
+    for row in diagnosis.baseline.table():
+        given.setdefault((row.effect, row.name), []).append(row)
     rows = []
-    for effect, name, value, std, unit in diagnosis.extended.table() if diagnosis.extended is not None else ():
-        old = given.get((effect, name))
+    for effect, name, value, std, unit in diagnosis.extended.table():
+        # Of several effects of one name each stands beside its own.
+        of_name = given.get((effect, name))
+        old = of_name.pop(0) if of_name else None
         rows.append(
             {
                 "effect": effect,
                 "name": spoken(name),
-                "before": with_uncertainty(old[2], old[3], old[4]) if old else "not in it",
+                "before": with_uncertainty(old.value, old.std, old.unit) if old else "not in it",
                 "after": with_uncertainty(value, std, unit),
+                "held": old is not None and old.std == 0.0,
                 "fixed": std == 0.0,
                 "new": old is None,
             }

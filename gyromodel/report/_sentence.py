@@ -6,11 +6,14 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from gyromodel.report._numbers import number, pair, unit_text, with_uncertainty
-from gyromodel.report._words import driver_name, listed, phrase, spoken
+from gyromodel.report._numbers import number, pair, stated, unit_text, with_uncertainty
+from gyromodel.report._words import definite, driven, driver_columns, is_driver, listed, phrase, spoken
 
 if TYPE_CHECKING:
-    from gyromodel.diagnosis._result import Cause, Diagnosis
+    from gyromodel.diagnosis._result import Cause, Diagnosis, ParameterValue
+    from gyromodel.estimate._calibration import ParameterRow
+
+Held = dict[str, "ParameterRow"]
 
 
 def sentence(diagnosis: Diagnosis) -> str:
@@ -26,7 +29,7 @@ def sentence(diagnosis: Diagnosis) -> str:
             return _ambiguous(diagnosis)
         case "unknown":
             return _unknown(diagnosis)
-    return f"{_lacks(diagnosis.causes)}; {_gain(diagnosis, _pronoun(diagnosis.causes))}."
+    return f"{_lacks(diagnosis, diagnosis.causes)}; {_gain(diagnosis, _pronoun(diagnosis))}."
 
 
 def kinds(diagnosis: Diagnosis) -> dict[str, str]:
@@ -48,10 +51,38 @@ def settled(diagnosis: Diagnosis) -> list[Cause]:
     return [cause for cause in diagnosis.causes if cause.effect not in doubtful]
 
 
+def held(diagnosis: Diagnosis, effect: str) -> Held:
+    """The parameters of an effect that the simulation has with all of them fixed, by name; none of any other.
+
+    Of several causes of one name it is not known which of them it is.
+    """
+    rows = [row for row in diagnosis.baseline.table() if row.effect == effect]
+    once = sum(cause.effect == effect for cause in diagnosis.causes) < 2
+    return {row.name: row for row in rows} if once and all(row.std == 0.0 for row in rows) else {}
+
+
+def member(diagnosis: Diagnosis, name: str, kind: str) -> str:
+    """One of the names that cannot be told apart, in words."""
+    return phrase(name, kind) + (" other than the simulation's" if held(diagnosis, name) else "")
+
+
+def followed(diagnosis: Diagnosis) -> list[str]:
+    """The columns of the driver that an unknown discrepancy follows; none without one."""
+    driver = diagnosis.driver
+    return [] if driver is None else driver_columns(driver.column, diagnosis.campaign.columns)
+
+
+def searched(diagnosis: Diagnosis) -> list[str]:
+    """What was searched, less what the simulation has already and of which no more was looked for."""
+    more = {*diagnosis.minimum_detectable, *(cause.effect for cause in diagnosis.causes)}
+    had = {row.effect for row in diagnosis.baseline.table()} - more
+    return [name for name in dict.fromkeys([*diagnosis.searched, *diagnosis.minimum_detectable]) if name not in had]
+
+
 def _adequate(diagnosis: Diagnosis) -> str:
-    known = {row.effect for row in diagnosis.baseline.table()}
-    drivers = [name for name in diagnosis.searched if name.startswith("smooth(")]
-    tried = len(set(diagnosis.searched) - known) - len(drivers)
+    names = searched(diagnosis)
+    drivers = [name for name in names if is_driver(name)]
+    tried = len(names) - len(drivers)
     smooth = f" and smooth functions of {len(drivers)} drivers" if drivers else ""
     count = f": {tried} effects{smooth} were searched and none stands out from the noise" if tried else ""
     error = diagnosis.gain.before
@@ -64,10 +95,10 @@ def _adequate(diagnosis: Diagnosis) -> str:
 def _ambiguous(diagnosis: Diagnosis) -> str:
     kind = kinds(diagnosis)
     firm = settled(diagnosis)
-    members = listed([phrase(name, kind.get(name, "effect")) for name in confused(diagnosis)], "or")
+    members = listed([member(diagnosis, name, kind.get(name, "effect")) for name in confused(diagnosis)], "or")
     lead = "Something real is missing from your simulation, but this campaign cannot tell what it is"
     if firm:
-        lead = f"{_lacks(firm)}, and something more is missing that this campaign cannot tell apart"
+        lead = f"{_lacks(diagnosis, firm)}, and something more is missing that this campaign cannot tell apart"
     test = (diagnosis.next_test or "").strip().rstrip(".")
     settle = f". The test that settles it: {test}" if test else ", and no single added test was found to settle it"
     return f"{lead}: {members}; {_gain(diagnosis, 'with any of these')}{settle}."
@@ -76,61 +107,91 @@ def _ambiguous(diagnosis: Diagnosis) -> str:
 def _unknown(diagnosis: Diagnosis) -> str:
     follows = "follows no single column that was recorded"
     if diagnosis.driver is not None:
-        column = diagnosis.driver.column
-        follows = f"follows {driver_name(column)}"
+        follows = f"follows {listed([driven(column) for column in followed(diagnosis)])}"
     elif "bias_periodic" in diagnosis.credible_set:
         follows = "oscillates with a size or a frequency that changes,"
     lead = f"Something real is missing from your simulation: its error {follows} and matches nothing in the catalogue"
     if effects := [cause for cause in diagnosis.causes if cause.effect != "outliers"]:
-        lead += f", though {_sized(effects)} would take up part of it"
+        lead += f", though {_sized(diagnosis, effects)} would take up part of it"
     gain = _gain(diagnosis, "with the curve that was found" if diagnosis.driver else "with what was found")
     return f"{lead}; {gain}."
 
 
-def _pronoun(causes: Sequence[Cause]) -> str:
+def _pronoun(diagnosis: Diagnosis) -> str:
+    causes = diagnosis.causes
     if all(cause.effect == "outliers" for cause in causes):
         return "with them set aside" if sum(len(cause.points) for cause in causes) != 1 else "with it set aside"
+    if all(held(diagnosis, cause.effect) for cause in causes):
+        return "with these" if len(causes) > 1 else "with that"
     return "with them" if len(causes) > 1 else "with it"
 
 
-def _lacks(causes: Sequence[Cause]) -> str:
-    """The effects that are missing, then the measured points that no effect explains."""
+def _lacks(diagnosis: Diagnosis, causes: Sequence[Cause]) -> str:
+    """The effects that are missing, those held at wrong values, then the measured points that no effect explains."""
     effects = [cause for cause in causes if cause.effect != "outliers"]
-    apart = sum(len(cause.points) for cause in causes if cause.effect == "outliers")
-    what = "point, which stands" if apart == 1 else "points, which stand"
-    points = f"cannot explain {apart or 'some'} measured {what} apart from all the others"
-    if not causes:
-        return "Something real is missing from your simulation"
-    if not effects:
-        return f"Your simulation {points}"
-    text = _sized(effects)
+    missing = [cause for cause in effects if not held(diagnosis, cause.effect)]
+    wrong = [_contradicted(cause, at) for cause in effects if (at := held(diagnosis, cause.effect))]
+    said = [f"lacks {_sized(diagnosis, missing)}"] if missing else []
+    said += [f"holds {', and '.join(wrong)}"] if wrong else []
     if len(effects) < len(causes):
-        text += f", and {points}"
-    return f"Your simulation lacks {text}"
+        apart = sum(len(cause.points) for cause in causes if cause.effect == "outliers")
+        what = "point, which stands" if apart == 1 else "points, which stand"
+        said.append(f"cannot explain {apart or 'some'} measured {what} apart from all the others")
+    return f"Your simulation {', and '.join(said)}" if said else "Something real is missing from your simulation"
 
 
-def _sized(effects: Sequence[Cause]) -> str:
+def _contradicted(cause: Cause, at: Held) -> str:
+    """An effect that the simulation holds at other values than the data say."""
+    sizes = [p for p in _sizes(cause) if p.name in at]
+    if not sizes:
+        return f"{definite(cause.effect)} at values that the data contradict"
+    return f"{definite(cause.effect)} at {_as_held(sizes, at)}, where the data say {_values(sizes)}"
+
+
+def _sized(diagnosis: Diagnosis, effects: Sequence[Cause]) -> str:
     """Effects with their sizes, in a list."""
-    items = [_with_size(cause) for cause in effects]
+    items = [_with_size(cause, held(diagnosis, cause.effect)) for cause in effects]
     if len(items) > 1 and any(len(cause.parameters) > 1 for cause in effects):
         return f"{'; '.join(items[:-1])}; and {items[-1]}"
     return listed(items)
 
 
-def _with_size(cause: Cause) -> str:
-    """The cause with its size; of many parameters with one coefficient or delay, if there is one."""
-    values = [p for p in cause.parameters if math.isfinite(p.value) and p.std != 0.0]
-    if any("[" in p.name for p in values):
-        values = [p for p in values if p.name in ("coefficient", "time_constant")]
-    if cause.effect == "scale_factor" and len(values) == 1:
-        if values[0].unit != "1":
-            return f"a scale factor of {with_uncertainty(values[0].value, values[0].std, values[0].unit)}"
-        error, std = 1e6 * (values[0].value - 1.0), 1e6 * values[0].std
+def _with_size(cause: Cause, at: Held) -> str:
+    """The cause with its size, in place of the one that the simulation holds it at."""
+    sizes = _sizes(cause)
+    if at:
+        sizes = [p for p in sizes if p.name in at]
+        other = f"{_values(sizes)} instead of {_as_held(sizes, at)}" if sizes else "other values"
+        return f"{definite(cause.effect)} at {other}"
+    if cause.effect == "scale_factor" and len(sizes) == 1:
+        if sizes[0].unit != "1":
+            return f"a scale factor of {_values(sizes)}"
+        error, std = 1e6 * (sizes[0].value - 1.0), 1e6 * sizes[0].std
         return f"{phrase(cause.effect)} of {with_uncertainty(error, std, 'ppm')}"
+    return " ".join([phrase(cause.effect), *(["of" if len(sizes) == 1 else "with", _values(sizes)] if sizes else [])])
+
+
+def _sizes(cause: Cause) -> list[ParameterValue]:
+    """The parameters that tell a cause's size; of many the one coefficient or delay, if there is one."""
+    sizes = [p for p in cause.parameters if math.isfinite(p.value) and p.std != 0.0]
+    if any("[" in p.name for p in sizes):
+        return [p for p in sizes if p.name in ("coefficient", "time_constant")]
+    return sizes
+
+
+def _values(sizes: Sequence[ParameterValue]) -> str:
+    return _each([with_uncertainty(p.value, p.std, p.unit) for p in sizes], sizes)
+
+
+def _as_held(sizes: Sequence[ParameterValue], at: Held) -> str:
+    return _each([stated(at[p.name].value, at[p.name].unit) for p in sizes], sizes)
+
+
+def _each(values: Sequence[str], sizes: Sequence[ParameterValue]) -> str:
+    """One value alone, or several with their names."""
     if len(values) == 1:
-        return f"{phrase(cause.effect)} of {with_uncertainty(values[0].value, values[0].std, values[0].unit)}"
-    sizes = [f"{spoken(p.name)} {with_uncertainty(p.value, p.std, p.unit)}" for p in values]
-    return f"{phrase(cause.effect)} with {listed(sizes)}" if sizes else phrase(cause.effect)
+        return values[0]
+    return listed([f"{spoken(p.name)} {value}" for p, value in zip(sizes, values, strict=True)])
 
 
 def _gain(diagnosis: Diagnosis, extension: str) -> str:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gyromodel.declarations import RATE_OF, column_of, measured
+from gyromodel.report._sentence import followed
 from gyromodel.report._words import spoken
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ def abscissae(diagnosis: Diagnosis) -> tuple[list[Abscissa], list[str]]:
     found = {"time": time_axis(campaign)}
     left_out = []
     for name in campaign.columns:
-        if name == "time" or name.startswith("output") or name in _HOUSEKEEPING:
+        if name in ("time", *campaign.outputs, *_HOUSEKEEPING):
             continue
         values = np.asarray(campaign.columns[name], float)
         if not varies(values):
@@ -72,8 +73,7 @@ def abscissae(diagnosis: Diagnosis) -> tuple[list[Abscissa], list[str]]:
         found[name] = Abscissa(name, label, campaign.units.get(name, ""), values)
     found |= _derived(campaign, found) | _folded(diagnosis)
     causes = [key for cause in diagnosis.causes for key in follows(cause.effect, found)]
-    if diagnosis.driver is not None:
-        causes += [key_of(column.strip()) for column in diagnosis.driver.column.split(",")]
+    causes += [key_of(column) for column in followed(diagnosis)]
     if any(cause.points for cause in diagnosis.causes):
         causes.append("rate")
     shares = {key: explained(a.values, diagnosis.residual_before) for key, a in found.items()}

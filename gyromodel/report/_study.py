@@ -169,7 +169,7 @@ def _tornado(axes: Axes, budget: Budget) -> None:
 
 
 def history_figure(found: Sensitivity) -> str:
-    """The angle's standard uncertainty over the mission, in all and by the parameters that lead at its end."""
+    """The angle's standard uncertainty over the mission, of three axes that of x, in all and by leading parameters."""
     with draw.style():
         figure, axes = draw.blank()
         figure.set_size_inches(6.6, 3.6)
@@ -178,15 +178,17 @@ def history_figure(found: Sensitivity) -> str:
         time = history.time / (3600.0 if hours else 1.0)
         power = draw.power_of_ten(float(np.max([history.std.max(), *(a.max() for a in history.alone.values())])))
         scale = 10.0**-power
-        axes.plot(
-            time, history.std * scale, color=draw.INK, linewidth=2.2, label="all, with their correlations", zorder=5
-        )
-        leading = sorted(history.alone.items(), key=lambda item: -float(item[1].max()))[:LINES]
+        # Parameters of three gyros are told by axis; the history is of the first.
+        three = any(name.startswith("y ") for name in history.alone)
+        alone = {name: std for name, std in history.alone.items() if not three or name.startswith("x ")}
+        whose = f"all{' of axis x' * three}, with their correlations"
+        axes.plot(time, history.std * scale, color=draw.INK, linewidth=2.2, label=whose, zorder=5)
+        leading = sorted(alone.items(), key=lambda item: -float(item[1].max()))[:LINES]
         colours = (draw.AFTER, draw.MARK, draw.BEFORE, draw.AFTER_DOT)
-        for (name, alone), colour, dash in zip(leading, colours, ("-", "--", "-.", ":"), strict=False):
-            axes.plot(time, alone * scale, dash, color=colour, linewidth=1.5, label=f"{name.replace('_', ' ')} alone")
+        for (name, std), colour, dash in zip(leading, colours, ("-", "--", "-.", ":"), strict=False):
+            axes.plot(time, std * scale, dash, color=colour, linewidth=1.5, label=f"{name.replace('_', ' ')} alone")
         axes.set_xlabel(draw.axis_label("time of the mission", "h" if hours else "s", 0))
-        axes.set_ylabel(draw.axis_label("angle, standard uncertainty", "deg", power))
+        axes.set_ylabel(draw.axis_label(f"angle{' about x' * three}, standard uncertainty", "deg", power))
         axes.set_ylim(bottom=0.0)
         axes.set_xlim(0.0, float(time[-1]))
         draw.legend(axes, 2)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 
 from gyromodel.declarations import EARLIER, RATE_OF, column_of, measured
 
@@ -89,13 +89,27 @@ def spoken(name: str) -> str:
     return re.sub(r"\s+", " ", name.replace("_", " ")).strip()
 
 
-def driver_name(text: str) -> str:
-    """The columns of a driver in words, from its label such as "smooth(rate, temperature)"."""
-    columns = text.removeprefix("smooth(").removesuffix(")") if text.startswith("smooth(") else text
-    return listed([_driven(column.strip()) for column in columns.split(",")])
+def driver_columns(driver: str, known: Container[str] = ()) -> list[str]:
+    """The columns of a driver, from its name "smooth(a, b)", or from "a" or "a and b" of known columns."""
+    if is_driver(driver):
+        return [column.strip() for column in driver.removeprefix("smooth(").removesuffix(")").split(",")]
+    halves = [(driver[: cut.start()], driver[cut.end() :]) for cut in re.finditer(" and ", driver)]
+    pairs = [pair for pair in halves if all(measured(column)[0] in known for column in pair)]
+    return [driver] if measured(driver)[0] in known or not pairs else list(pairs[0])
 
 
-def _driven(column: str) -> str:
+def is_driver(name: str) -> bool:
+    """Whether a name is that of a driver and not of the catalogue."""
+    return name.startswith("smooth(")
+
+
+def driver_name(driver: str, known: Container[str] = ()) -> str:
+    """The columns of a driver in words, from what `driver_columns` takes."""
+    return listed([driven(column) for column in driver_columns(driver, known)])
+
+
+def driven(column: str) -> str:
+    """A column that a driver follows, or what is derived of it, in words."""
     base, form = measured(column)
     if (base, form) == ("rate", RATE_OF):
         return "angular acceleration"
@@ -106,8 +120,8 @@ def _driven(column: str) -> str:
 
 
 def phrase(effect: str, kind: str = "effect") -> str:
-    """An effect as a noun with its article; of kind "angle" the noise of an angle."""
-    if kind == "driver":
+    """An effect or a driver as a noun with its article; of kind "angle" the noise of an angle."""
+    if is_driver(effect):
         return f"some smooth function of {driver_name(effect)}"
     if kind == "angle" and effect in _OF_ANGLE:
         return _OF_ANGLE[effect]
@@ -118,6 +132,12 @@ def phrase(effect: str, kind: str = "effect") -> str:
     if base.startswith("bias_"):
         return f"a bias proportional to {spoken(column_of(effect))}"
     return f"an effect named {spoken(effect)}"
+
+
+def definite(effect: str) -> str:
+    """An effect that the simulation has, with the definite article."""
+    own = {"bias": "the bias", "scale_factor": "the scale factor"}
+    return own.get(effect) or re.sub(r"^an? ", "the ", phrase(effect).partition(":")[0])
 
 
 def title(effect: str, kind: str = "effect") -> str:
