@@ -48,11 +48,11 @@ def diagnose_axes(
     for name in measured[0].outputs:
         axis = name.removeprefix("output_")
         dead = [reason for c in measured if name in c.columns and (reason := c.dead(name))]
+        alone = [] if dead else [campaign.axis(axis) for campaign in measured]
         try:
-            if not dead:
-                alone = [campaign.axis(axis) for campaign in measured]
+            if alone:
                 diagnosis, verdict = diagnose_to(alone, model, output / axis, calibrate=calibrate, seed=seed)
-        except (EstimateError, ModelError) as error:
+        except (CampaignError, EstimateError, ModelError) as error:
             dead = [str(error)]
         if dead:
             not_diagnosed[axis] = dead[0]

@@ -151,6 +151,7 @@ def batch(
 
     A campaign that cannot be read or fitted is a row with its reason, and the exit status is then 1.
     """
+    output = output if output.suffix else output.with_suffix(".parquet")
     refuse_suffix(output, [".parquet"])
     refuse_overwriting(output, [model, Path(archive)])
     from gyromodel._archive_files import batch_to
@@ -203,20 +204,20 @@ def export(
     ] = None,
     axis: Annotated[
         Literal["x", "y", "z"] | None,
-        typer.Option("--axis", help="Axis of the autopilot, with --to px4 only.", show_default=False),
+        typer.Option("--axis", help="Axis of the autopilot, with --to px4 only; x unless told.", show_default=False),
     ] = None,
 ) -> None:
     """Write a calibration for firmware and spreadsheets; to PX4, that of one axis."""
-    if (to == "px4") != (axis is not None):
-        raise typer.BadParameter(
-            "PX4 parameters, and these alone, are of one axis: --to px4 --axis x", param_hint="--axis"
-        )
+    if axis and to != "px4":
+        raise typer.BadParameter("only PX4 parameters are of one axis: --to px4 --axis x", param_hint="--axis")
     if output:
         refuse_overwriting(output, [model])
     from gyromodel.export import export_calibration
     from gyromodel.model_files import read_calibration
 
     text = export_calibration(read_calibration(model), to, axis or "x")
+    if to == "px4" and not axis:
+        print("gyromodel: the parameters are those of the autopilot's axis x (--axis takes another)", file=sys.stderr)
     if output:
         write_text(output, text)
     else:

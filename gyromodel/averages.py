@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
-from gyromodel._checks import NUMBERED
+from gyromodel._checks import MISSING_STEP, NUMBERED
 from gyromodel.campaign import Campaign
 from gyromodel.numerics.stretches import GAP
 from gyromodel.signals import rate_output
@@ -93,3 +94,22 @@ def as_rate(campaign: Campaign) -> Campaign:
         {**campaign.metadata, "kind": "rate"},
         campaign.name,
     )
+
+
+def with_interval_rates(campaign: Campaign) -> Campaign:
+    """The campaign with its output as a rate, and reference rates as their means over the interval before each row.
+
+    The means are those of a cubic spline through the rates. In the first row and behind gaps none is known, and the
+    output is left out.
+    """
+    campaign = as_rate(campaign)
+    time, step = campaign.columns["time"], np.diff(campaign.columns["time"], prepend=np.nan)
+    unknown = ~(step <= MISSING_STEP * np.nanmedian(step))
+    for name in campaign.covariates:
+        values = campaign.columns[name]
+        if name.partition("_")[0] == "rate" and np.isfinite(values).all():
+            turned = CubicSpline(time, values).antiderivative()(time)
+            means = np.where(unknown, values, np.diff(turned, prepend=np.nan) / step)
+            campaign = campaign.with_column(name, means, campaign.units[name])
+    output = np.where(unknown, np.nan, campaign.columns["output"])
+    return campaign.with_column("output", output, campaign.units["output"])

@@ -10,6 +10,7 @@ import gzip
 import math
 import mmap
 import os
+import re
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -34,6 +35,9 @@ from gyromodel.campaign import Campaign
 
 # Orders the variables of a NetCDF or Zarr file, which keep no order of their own.
 _POSITION = "column"
+# Times as CF counts them, from a date, in units that it spells out.
+_CF_TIME = re.compile(r"(\w+) since .+")
+_CF_UNITS = {"milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns"}
 _ZARR_FILES = ("zarr.json", ".zgroup")
 
 
@@ -277,8 +281,10 @@ def _read_zarr(path: Path) -> Contents:
             # Before a value is read: codecs of objects may run what is in the file.
             if array.dtype.kind not in "iuf":
                 raise CampaignError(f"column '{name}' holds {array.dtype}, expected numbers")
-            # Zarr reads a chunk that is not there as fill values, which would pass for missing samples.
-            if missing := array.nchunks - array.nchunks_initialized:
+            # Zarr reads a chunk that is not there as fill values, which would pass for missing samples. Writers leave
+            # out chunks of zeros, which no time or output is.
+            missing = array.nchunks - array.nchunks_initialized
+            if missing and ((array.dtype.kind == "f" and np.isnan(array.fill_value)) or re.match("time|output", name)):
                 raise CampaignError(
                     f"column '{name}' lacks {missing} of {array.nchunks} chunks: the copy is not complete"
                 )
@@ -300,6 +306,8 @@ def _read_dataset(path: Path, **options: Any) -> Contents:
             if variable.dtype.kind not in "iuf":
                 raise CampaignError(f"column '{name}' holds {variable.dtype}, expected numbers")
             unit = variable.attrs.get("units")
+            since = _CF_TIME.fullmatch(str(unit)) if name == "time" else None
+            unit = _CF_UNITS.get(since[1], since[1]) if since else unit
             units[name] = check_unit(name, None if unit is None else str(unit))
             columns[name] = np.asarray(variable.values, dtype=np.float64)
     return columns, units, metadata

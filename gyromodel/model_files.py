@@ -148,13 +148,12 @@ def _read_effect(place: Place) -> tuple[Effect, set[tuple[str, str]]]:
     declared = effect.declared()
     settings = effect.settings()
     found = place.mapping(("effect", "value", "fixed", "std", *declared, *settings), label)
-    if "value" in found and len(declared) == 1:
-        name, given = next(iter(declared)), found.pop("value")
+    if "value" in found:
+        given = found.pop("value")
+        name = _meant(given, effect)
         if name in found:
             raise given.error(f"value and {name} are the same parameter; keep one")
         found[name] = given
-    elif "value" in found:
-        raise found["value"].error(f"{label} has several parameters; name them: {', '.join(declared)}")
     values: dict[str, Any] = {"column": effect.column} if isinstance(effect, BiasColumn) else {}
     for name in declared:
         if name in found:
@@ -167,6 +166,18 @@ def _read_effect(place: Place) -> tuple[Effect, set[tuple[str, str]]]:
     except (TypeError, ValueError) as problem:
         raise place.error(f"{label}: {str(problem).splitlines()[0]}") from None
     return effect, _read_fixed(found["fixed"], effect) if "fixed" in found else set()
+
+
+def _meant(place: Place, effect: Effect) -> str:
+    """The parameter that a plain `value` is of: the only one, the only one that its unit suits, or the coefficient."""
+    declared = effect.declared()
+    if len(declared) == 1:
+        return next(iter(declared))
+    unit = place.quantity()[1] if isinstance(place.node, yaml.ScalarNode) else ""
+    suits = [name for name, each in declared.items() if unit and convertible(unit, each.unit)]
+    if len(suits) != 1 and suits[:1] != ["coefficient"]:
+        raise place.error(f"{effect.label} has several parameters; name them: {', '.join(declared)}")
+    return suits[0]
 
 
 def _read_fixed(place: Place, effect: Effect) -> set[tuple[str, str]]:

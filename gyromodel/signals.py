@@ -195,14 +195,10 @@ def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
         CampaignError: columns, units or kinds of the campaigns do not match.
     """
     campaigns = [campaigns] if isinstance(campaigns, Campaign) else list(campaigns)
-    names = ["time", *campaigns[0].covariates]
     for other in campaigns[1:]:
         _check_alike(campaigns[0], other)
-        missing = set(names) ^ {"time", *other.covariates}
-        if missing:
-            raise CampaignError(
-                f"{other.name}: campaigns fitted together need the same columns; {min(missing)} is in only some"
-            )
+    apart = columns_apart(campaigns)
+    names = ["time", *(name for name in campaigns[0].covariates if name not in apart)]
     runs = _counted_on([c.si("run") for c in campaigns]) if "run" in names else []
     parts: dict[str, list[np.ndarray]] = {}
     blocks, schemes, unit = [], set(), ""
@@ -238,6 +234,21 @@ def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
     units = {"campaign": ""} | {n: campaigns[0].units[n] for n in names}
     record = laid_out(signals, np.concatenate(blocks), " and ".join(sorted(schemes)), unit, units)
     return record._replace(data_hash="+".join(c.digest() for c in campaigns))
+
+
+def columns_apart(campaigns: Sequence[Campaign]) -> list[str]:
+    """Columns that only some campaigns have: what is of all of them together knows nothing of these.
+
+    Raises:
+        CampaignError: it is a rate or numbers stretches, so that the others would be taken for something else.
+    """
+    each = [set(c.covariates) for c in campaigns]
+    apart = sorted(set.union(*each) - set.intersection(*each))
+    for name in apart:
+        if name in NUMBERED or name.partition("_")[0] == "rate":
+            one = next(c for c in campaigns if name not in c.columns)
+            raise CampaignError(f"{one.name}: campaigns fitted together need the same columns; {name} is in only some")
+    return apart
 
 
 def _usual_step(interval: np.ndarray, restart: np.ndarray, output: np.ndarray) -> float:
@@ -290,15 +301,27 @@ def _time_on(campaign: Campaign, time: np.ndarray) -> np.ndarray:
 
     One that follows without a gap was not off before.
     """
-    value = campaign.metadata.get("time_since_power_on", 0.0)
-    if isinstance(value, str):
-        raise CampaignError(f"{campaign.name}: metadata time_since_power_on is {value!r}, expected a number of seconds")
     runs = campaign.columns.get("run", np.zeros(len(time)))
     step, other = np.diff(time), np.diff(runs) != 0
     # Where each row is a run of its own, each begins with one.
     usual = 0.0 if other.all() else np.median(step[~other])
     begins = np.append(True, other & (step > OFF * usual))
-    return time - time[np.flatnonzero(begins)][np.cumsum(begins) - 1] + float(value)
+    return time - time[np.flatnonzero(begins)][np.cumsum(begins) - 1] + time_since_power_on(campaign)
+
+
+def time_since_power_on(campaign: Campaign) -> float:
+    """How long (s) before the first sample the gyro was turned on, as the metadata say: a time, or a number of seconds.
+
+    Raises:
+        CampaignError: they say something else.
+    """
+    value = campaign.metadata.get("time_since_power_on", 0.0)
+    try:
+        number, unit = quantity(str(value))
+        return number * (factor(unit, "s") if unit else 1.0)
+    except UnitError:
+        said = f"{campaign.name}: metadata time_since_power_on is {value!r}, expected a time such as 120 s"
+        raise CampaignError(said) from None
 
 
 def thermometer_rate(record: Record, temperature: np.ndarray) -> np.ndarray:

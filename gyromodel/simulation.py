@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gyromodel._checks import CampaignError
 from gyromodel.campaign import Campaign
 from gyromodel.model import GyroModel, ModelError, check_units
 from gyromodel.noise import NoiseRatios, markov_sum, stated_ratios
@@ -26,6 +27,8 @@ def simulate(model: GyroModel, campaign: Campaign, seed: int = 0) -> Campaign:
         CampaignError: it is no campaign of one gyro.
         ModelError: the model misses a value or a column, or what it states of the noise is none.
     """
+    if any(name.startswith("gimbal_") for name in campaign.columns):
+        raise CampaignError(f"{campaign.name}: is of a platform, and a model is simulated for a gyro")
     if not campaign.outputs:
         campaign = campaign.with_column("output", np.arange(len(campaign), dtype=float), "deg/s")
     elif "output" in campaign.columns:  # every row gets one, whatever was missing

@@ -17,7 +17,7 @@ from gyromodel.effects.power_cycles import BiasTurnOn
 from gyromodel.effects.scale import ScaleFactor
 from gyromodel.effects.thermometer import TemperatureLag
 from gyromodel.estimate import Calibration, fit_record
-from gyromodel.model import GyroModel, model_from_effects
+from gyromodel.model import GyroModel, ModelError, model_from_effects
 from gyromodel.report import sentence
 from gyromodel.signals import read_signals, with_columns_known
 
@@ -182,3 +182,32 @@ def test_a_scale_factor_error_is_told_in_ppm(rng: np.random.Generator):
     [cause] = [c for c in found.causes if c.effect == "scale_factor"]
     assert cause.parameters[0].value == pytest.approx(1.001, abs=1e-4)
     assert " ppm" in sentence(found)
+
+
+@pytest.mark.parametrize("counted", [True, False])
+def test_increments_over_intervals_are_not_late(counted: bool, rng: np.random.Generator):
+    """Beside rates at the rows, whose product with the interval other increments are: both are what they should be."""
+    time = 0.01 * np.arange(1500)
+    rate = 10.0 * np.sin(4.4 * time) + 3.0 * np.cos(12.0 * time)
+    turned = -10.0 / 4.4 * np.cos(4.4 * time) + 3.0 / 12.0 * np.sin(12.0 * time)
+    output = (np.diff(turned, prepend=np.nan) if counted else 0.01 * rate) + 2e-5 * rng.standard_normal(1500)
+    measured = campaign(output, 0.01, "deg", "increment", rate=rate)
+    found = gm.diagnose(measured, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
+    assert found.verdict == "adequate"
+    assert any("counts over the interval" in line for line in found.findings) is counted
+
+
+def test_a_value_that_a_mean_would_hide_is_refused():
+    temperature = np.where(np.arange(20_100) == 7, np.nan, 20.0)
+    measured = campaign(np.arange(20_100.0), temperature=temperature)
+    with pytest.raises(ModelError, match="needs column temperature, which is NaN in data rows 8"):
+        gm.diagnose(measured, gm.model_from_effects(["bias", "bias_temperature"]))
+
+
+def test_a_column_of_some_campaigns_is_not_searched(rng: np.random.Generator):
+    first, second = (campaign(rng.standard_normal(9), temperature=rng.standard_normal(9)) for _ in range(2))
+    first = first.with_column("heater", np.arange(9.0), "W")
+    data = read([first, second])
+    assert "heater is in only some of the campaigns: it was not searched." in data.findings
+    assert "heater" not in data.record.signals
+    assert "heater" not in data.whole.columns

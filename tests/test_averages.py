@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gyromodel._checks import CampaignError
-from gyromodel.averages import average, turning
+from gyromodel.averages import average, turning, with_interval_rates
 from gyromodel.campaign import Campaign
 
 ROWS = 1000
@@ -49,3 +49,17 @@ def test_three_axes_of_increments_are_asked_to_choose_one():
     campaign = Campaign(columns, {n: "s" if n == "time" else "arcsec" for n in columns}, {"kind": "increment"})
     with pytest.raises(CampaignError, match="choose one axis"):
         average(campaign, 200)
+
+
+def test_rates_over_intervals_are_what_an_angle_has_turned():
+    """Of a sine, whose integral is known; not in the first row, nor behind a gap."""
+    time = np.delete(0.01 * np.arange(400), range(200, 210))
+    angle, rate = -10.0 / 3.0 * np.cos(3.0 * time), 10.0 * np.sin(3.0 * time)
+    columns = {"time": time, "rate": rate, "temperature": rate, "output": np.diff(angle, prepend=0.0)}
+    units = {"time": "s", "rate": "deg/s", "temperature": "degC", "output": "deg"}
+    of = with_interval_rates(Campaign(columns, units, {"kind": "increment"}))
+    known = np.isfinite(of.columns["output"])
+    assert np.flatnonzero(~known).tolist() == [0, 200]
+    assert of.columns["rate"][known] == pytest.approx(np.diff(angle, prepend=0.0)[known] / 0.01, abs=2e-6)
+    assert np.abs(rate - of.columns["rate"])[known].max() > 0.1
+    assert (of.columns["temperature"] == rate).all()

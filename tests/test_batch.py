@@ -13,6 +13,7 @@ import time
 from hashlib import sha256
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import psutil
 import pyarrow as pa
@@ -27,10 +28,13 @@ from gyromodel.batch import _work as work
 from gyromodel.batch._references import referred
 from gyromodel.batch._results import SCHEMA, Results
 from gyromodel.campaign import Campaign
+from gyromodel.effects.drivers import BiasStep
 from gyromodel.estimate import fit
 from gyromodel.files import read_campaign, write_campaign
+from gyromodel.model import GyroModel
 from gyromodel.model_files import read_model
 from gyromodel.platform import fit_vibration
+from gyromodel.signals import read_signals
 
 MODEL = "effects: [{effect: bias}, {effect: bias_temperature}]\n"
 # Of two lengths, so that few shapes are compiled.
@@ -699,3 +703,12 @@ def test_parameters_of_unlike_structure_do_not_mix(tmp_path: Path):
     assert found["misalignment.angles[about rate_spin]"] == pytest.approx(arcsec, rel=1e-3)
     assert found["misalignment.angles[about rate_output]"] == pytest.approx(-2 * arcsec, rel=1e-3)
     assert "misalignment.angles" not in found
+
+
+def test_two_effects_of_one_name_are_two_parameters():
+    steps = tuple(
+        BiasStep(size=jnp.asarray(size), epoch=jnp.asarray(epoch)) for size, epoch in ((1.0, 9.0), (2.0, 20.0))
+    )
+    model, record = GyroModel(steps, {}), read_signals(campaign(0))
+    rows = work._parameters({}, record, model, np.eye(len(model.slots())), 1)
+    assert [r["parameter"] for r in rows] == [f"bias_step{k}.{n}" for k in ("", "[2]") for n in ("size", "epoch")]

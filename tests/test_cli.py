@@ -446,7 +446,26 @@ def test_export_prints_or_writes(fitted: Path, run: Run, to: str, part: str):
 
 def test_export_lists_its_forms(run: Run):
     assert "'c', 'json', 'csv', 'px4'" in run("export", "m.yaml", "--to", "matlab").err
-    assert "--to px4 --axis x" in run("export", "m.yaml", "--to", "px4").err
+    assert "--to px4 --axis x" in run("export", "m.yaml", "--to", "c", "--axis", "x").err
+
+
+def test_px4_parameters_are_of_axis_x_unless_told(bench: Path, run: Run):
+    (bench / "flat.yaml").write_text("effects: [{effect: bias, value: 3 deg/h}]")
+    plain = run("export", bench / "flat.yaml", "--to", "px4")
+    assert plain.status == 0, plain.err
+    assert "axis x" in plain.err
+    assert plain.out == run("export", bench / "flat.yaml", "--to", "px4", "--axis", "x").out
+    assert plain.out != run("export", bench / "flat.yaml", "--to", "px4", "--axis", "y").out
+
+
+def test_a_platform_is_no_gyro_to_simulate(bench: Path, run: Run):
+    (bench / "flat.yaml").write_text("effects: [{effect: bias, value: 3 deg/h}]")
+    rows = "".join(f"{t},{t},1\n" for t in range(9))
+    (bench / "gimbals.csv").write_text(f"time [s],gimbal_1 [deg],table_x [deg]\n{rows}")
+    like = run("simulate", bench / "flat.yaml", "--like", bench / "gimbals.csv", "-o", bench / "out.csv")
+    assert (like.status, "is of a platform" in like.err) == (1, True)
+    searched = run("diagnose", bench / "gimbals.csv", "--model", bench / "flat.yaml", "-o", bench / "out")
+    assert "a platform's gimbals are gimbal_y_outer" in refusal(searched)
 
 
 def test_export_refuses_a_model_without_values(bench: Path, run: Run):

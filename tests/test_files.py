@@ -430,3 +430,29 @@ def test_measured_data_load(measured_data: Callable[[str], Path], name: str):
         assert len(campaign) == 1_000_000
         steps = campaign.columns["output_x"] / 0.05
         np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
+
+
+def test_chunks_of_zeros_that_a_writer_left_out_are_zeros(tmp_path: Path):
+    """As xarray writes whole numbers; a missing chunk of times, outputs or other measured values is damage."""
+    import xarray as xr
+
+    columns = {"time": ("s", np.arange(5.0)), "run": ("1", np.zeros(5, int)), "output": ("deg/s", np.arange(5.0))}
+    data = {name: ("time", values, {"units": unit}) for name, (unit, values) in columns.items()}
+    path = tmp_path / "a.zarr"
+    xr.Dataset(data, attrs={"kind": "rate"}).to_zarr(path, consolidated=False)
+    assert not (path / "run" / "c").exists()
+    assert not read_campaign(path).columns["run"].any()
+    shutil.rmtree(path / "output" / "c")
+    with pytest.raises(CampaignError, match="'output' lacks 1 of 1 chunks"):
+        read_campaign(path)
+
+
+def test_times_since_a_date_are_times(tmp_path: Path):
+    import xarray as xr
+
+    dates = np.datetime64("2026-01-01T00:00:00", "ns") + np.arange(5) * np.timedelta64(500, "ms")
+    data = {"output": ("time", np.arange(5.0), {"units": "deg/s"})}
+    xr.Dataset(data, coords={"time": dates}, attrs={"kind": "rate"}).to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    campaign = read_campaign(tmp_path / "a.nc")
+    assert campaign.units["time"] == "ms"
+    assert np.diff(campaign.si("time")) == pytest.approx(0.5)

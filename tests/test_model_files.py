@@ -369,7 +369,7 @@ BAD = [
     (entry("{effect: bias_drift, value: {value: 3, unit: deg/h/h}}"), 4, "unknown key 'unit'"),
     (entry("{effect: bias_drift, value: {value: {value: 3 deg/h/h}}}"), 4, "one value"),
     (entry("{effect: bias_drift, value: 3 deg/h/h, slope: 4 deg/h/h}"), 4, "value and slope are the same"),
-    (entry("{effect: bias_warmup, value: 3 deg/h}"), 4, "several parameters; name them: amplitude, time_constant"),
+    (entry("{effect: bias_warmup, value: 3}"), 4, "several parameters; name them: amplitude, time_constant"),
     (entry("{effect: bias_drift, fixed: maybe}"), 4, "fixed is true, false or a list"),
     (entry("{effect: bias_drift, fixed: [pace]}"), 4, "fixed is true, false or a list"),
     (entry("{effect: scale_factor, fixed: true}"), 4, "scale_factor is fixed but has no value"),
@@ -560,3 +560,17 @@ def test_a_line_beside_the_curve_that_holds_it_is_left_to_the_curve(tmp_path: Pa
     known = "{effect: bias_temperature, value: 3 deg/h/degC, fixed: true}"
     path.write_text(f"effects: [{known}, {{effect: bias_temperature_curve}}]")
     assert read_model(path).labels == ("bias_temperature", "bias_temperature_curve")
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "value"),
+    [
+        ("{effect: bias_warmup, value: 3 deg/h}", "amplitude", 3 * np.pi / 180 / 3600),
+        ("{effect: bias_warmup, value: 20 min, amplitude: 1 deg/h}", "time_constant", 1200.0),
+        ("{effect: time_delay, value: 5 ms}", "delay", 0.005),
+        ("{effect: bias_temperature_rate, value: 3600 deg/h/(degC/s)}", "coefficient", np.pi / 180),
+    ],
+)
+def test_a_plain_value_is_of_the_parameter_that_its_unit_suits(tmp_path: Path, text: str, name: str, value: float):
+    [effect] = read(tmp_path, f"effects: [{text}]").effects
+    assert np.ravel(getattr(effect, name)) == pytest.approx([value])

@@ -117,11 +117,14 @@ def test_runs_of_one_row_begin_with_a_power_on_each():
     assert not np.asarray(read_signals(measured).signals["time_on"])[:6].any()
 
 
-def test_power_on_time_must_be_a_number(rng: np.random.Generator):
+def test_power_on_time_is_a_time_or_a_number_of_seconds(rng: np.random.Generator):
     measured = campaign(np.arange(9.0), rng.standard_normal(9))
     late = Campaign(measured.columns, measured.units, {"kind": "rate", "time_since_power_on": "soon"})
-    with pytest.raises(CampaignError, match="time_since_power_on is 'soon', expected a number of seconds"):
+    with pytest.raises(CampaignError, match="time_since_power_on is 'soon', expected a time such as 120 s"):
         read_signals(late)
+    for given, seconds in (("2 min", 120.0), ("90", 90.0), (30, 30.0)):
+        warm = Campaign(measured.columns, measured.units, {"kind": "rate", "time_since_power_on": given})
+        assert read_signals(warm).signals["time_on"][0] == seconds
 
 
 @pytest.mark.parametrize("unit", ["arcsec", "count"])
@@ -315,6 +318,10 @@ def test_campaigns_that_do_not_match_are_refused(rng: np.random.Generator):
         read_signals([plain, campaign(time, output, rate=output)])
     with pytest.raises(CampaignError, match=r"column 'output' is in \[count/s\], but in \[deg/h\]"):
         read_signals([plain, campaign(time, output, "count/s")])
+    with pytest.raises(CampaignError, match="need the same columns; run is in only some"):
+        read_signals([campaign(time, output, run=output), plain])
+    extra = read_signals([campaign(time, output, heater=output), campaign(time, output * 2)])
+    assert "heater" not in extra.signals
     same = read_signals([plain, campaign(time, output * 3600, "arcsec/h")])
     first, second = output_of(same)[:60], output_of(same)[60:]
     assert first == pytest.approx(second)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any, NamedTuple
@@ -155,16 +156,12 @@ def _parameters(
 ) -> list[Row]:
     head = head | {"samples": int(record.present.sum()), "iterations": iterations}
     of = {effect.label: _structure(effect) for effect in model.effects}
-    rows = [
-        head
-        | {
-            "parameter": f"{r.effect}.{r.name}{of[r.effect]}",
-            "value": float(r.value),
-            "std": float(r.std),
-            "unit": r.unit,
-        }
-        for r in calibration_of(model, covariance, record, 0).table()
-    ]
+    rows, seen = [], Counter[tuple[str, str]]()
+    for r in calibration_of(model, covariance, record, 0).table():
+        seen[r.effect, r.name] += 1
+        again = f"[{k}]" if (k := seen[r.effect, r.name]) > 1 else ""  # a second step, say
+        name = f"{r.effect}{again}.{r.name}{of[r.effect]}"
+        rows.append(head | {"parameter": name, "value": float(r.value), "std": float(r.std), "unit": r.unit})
     for name, found in noise_table(model, noise or {}).items():
         ends = {"low": _known(found["lo"]), "high": _known(found["hi"])}
         rows.append(head | {"parameter": name, "value": float(found["value"]), "unit": str(found["unit"])} | ends)

@@ -14,9 +14,9 @@ from gyromodel.averages import MEAN_OF_ATTITUDE, MOST_TURN, as_rate, average, tu
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._variance import steps_of_output, stretch_still, thermometers_still
 from gyromodel.numerics.stretches import stretches_of
-from gyromodel.platform import is_platform, vibration_record
+from gyromodel.platform import GIMBALS, is_platform, vibration_record
 from gyromodel.poses import at_rest
-from gyromodel.signals import Record, read_signals
+from gyromodel.signals import Record, columns_apart, read_signals, time_since_power_on
 from gyromodel.units import convertible
 
 # What a pose tells is in its mean: within it, means over so long (s) are enough, and keep out a hand's tremor.
@@ -65,6 +65,10 @@ def read(measured: Sequence[Campaign], without: str = "") -> Data:
 
 
 def _of_gyro(measured: Sequence[Campaign]) -> Data:
+    for campaign in measured:
+        if "output" not in campaign.columns:
+            named = ", ".join(GIMBALS)
+            raise CampaignError(f"{campaign.name}: there is no column 'output', and a platform's gimbals are {named}")
     refuse_navigated(measured)
     as_given, measured = measured, [_with_runs(measured[0])] if len(measured) == 1 else measured
     given, of_attitude = zip(*(with_reference_rates(c) for c in measured), strict=True)
@@ -103,6 +107,7 @@ def _of_gyro(measured: Sequence[Campaign]) -> Data:
     findings += [line for c in given for line in thermometers_still(c)]
     searched = tuple(c for c, _ in shortened)
     record = read_signals(searched)
+    findings += [f"{n} is in only some of the campaigns: it was not searched." for n in columns_apart(searched)]
     if any(m > 1 for _, m in shortened):
         record = _of_means(record, campaigns, searched)
     if "run" in searched[0].columns and "run" not in as_given[0].columns:
@@ -117,8 +122,8 @@ def _of_gyro(measured: Sequence[Campaign]) -> Data:
 
 def _without_power_cycles(record: Record, campaign: Campaign) -> Record:
     """The record of one campaign, its runs being stretches: nothing tells that the gyro was off between them."""
-    since = float(campaign.metadata.get("time_since_power_on", 0.0))
-    return record._replace(signals=record.signals | {"time_on": record.signals["time"] + since})
+    time_on = record.signals["time"] + time_since_power_on(campaign)
+    return record._replace(signals=record.signals | {"time_on": time_on})
 
 
 def _of_means(record: Record, campaigns: Sequence[Campaign], means: Sequence[Campaign]) -> Record:
@@ -164,7 +169,7 @@ def _rate_unit(campaign: Campaign) -> str:
 
 def _together(campaigns: Sequence[Campaign]) -> Campaign:
     first = campaigns[0]
-    names = [n for n in first.columns if n != "time"]
+    names = [n for n in first.columns if n != "time" and n not in columns_apart(campaigns)]
     columns = {"time": [], **{n: [] for n in names}}
     start = 0.0
     for campaign in campaigns:
@@ -173,6 +178,7 @@ def _together(campaigns: Sequence[Campaign]) -> Campaign:
         start = columns["time"][-1][-1] + np.median(np.diff(time))
         for name in names:
             columns[name].append(campaign.in_unit(name, first.units[name]))
-    whole = Campaign({n: np.concatenate(v) for n, v in columns.items()}, first.units, first.metadata, first.name)
+    units = {n: first.units[n] for n in columns}
+    whole = Campaign({n: np.concatenate(v) for n, v in columns.items()}, units, first.metadata, first.name)
     number = np.repeat(1.0 + np.arange(len(campaigns)), [len(c) for c in campaigns])
     return whole if "campaign" in names else whole.with_column("campaign", number, "")

@@ -10,9 +10,10 @@ from typing import Literal
 import numpy as np
 
 from gyromodel._checks import listed
+from gyromodel.averages import with_interval_rates
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._calibrate import null_scores, threshold_of
-from gyromodel.diagnosis._data import read
+from gyromodel.diagnosis._data import Data, read
 from gyromodel.diagnosis._gain import nested_gain, no_gain, not_measured
 from gyromodel.diagnosis._isolation import settling_test
 from gyromodel.diagnosis._misfit import excess_band, unexplained_axes
@@ -26,7 +27,14 @@ from gyromodel.diagnosis._shapes import driver_shape, minimum_detectable, not_te
 from gyromodel.diagnosis._steps import Found
 from gyromodel.diagnosis._variance import follow, growing_noise, noise_level, tails
 from gyromodel.diagnosis._verdict import FAINT, judge, structured, with_noise
-from gyromodel.estimate import Estimate, EstimateError, check_covariates, fit_record, with_noise_intervals
+from gyromodel.estimate import (
+    Estimate,
+    EstimateError,
+    check_covariates,
+    fit_record,
+    refuse_missing,
+    with_noise_intervals,
+)
 from gyromodel.model import GyroModel
 from gyromodel.signals import with_columns_known
 from gyromodel.units import factor, from_internal
@@ -37,6 +45,13 @@ FOLD_NEARBY = 3.0
 SMOOTHED = (
     "Temperatures were smoothed: the error follows the smooth record better, so that the rest is noise of the "
     "thermometer, which the model adds where it is applied to temperatures as they were read."
+)
+# What outputs counted over intervals seem to have beside reference rates at the ends of these; and by how many nats
+# the means of the rates must leave less, and that for each parameter more.
+LATE, CLEARER, PARAMETER = {"time_delay", "bandwidth"}, 2.0, 4.0
+COUNTED = (
+    "The output counts over the interval before each row, and is late by half of it beside rates at its end: the means "
+    "of the reference rates over the intervals were taken, which leave no more."
 )
 
 
@@ -73,6 +88,7 @@ def diagnose(
     data = read(measured)
     record, findings, unit = data.record, list(data.findings), data.unit
     check_covariates(record, model)
+    _refuse_missing(measured, data, model)
     record, left_out = with_columns_known(record)
     findings += left_out
     say("fitting the simulation", 0.02)
@@ -178,7 +194,7 @@ def diagnose(
     slopes = [np.asarray(e.model.slope(record.signals))[: record.rows] for e in (baseline, extended)]
     output = np.where(record.present, np.asarray(record.signals["output"])[: record.rows], np.nan)
     sizes = minimum_detectable(session.scanner, selection.last, session.threshold, unit)
-    return Diagnosis(
+    found = Diagnosis(
         verdict=judgement.verdict,
         causes=judgement.causes,
         driver=driver,
@@ -206,6 +222,33 @@ def diagnose(
         baseline=baseline,
         extended=extended,
     )
+    if record.domain == "gyro" and measured[0].metadata["kind"] != "rate" and LATE & {c.effect for c in found.causes}:
+        whole = [with_interval_rates(c) for c in measured]
+        again = diagnose(whole, model, hold_out=hold_out, calibrate=calibrate, seed=seed, progress=progress)
+        if _more_likely(found, again):
+            return replace(again, findings=(COUNTED, *again.findings))
+    return found
+
+
+def _refuse_missing(measured: Sequence[Campaign], data: Data, model: GyroModel) -> None:
+    """As `check_covariates`, of what was averaged: a mean would hide a row that lacks a value."""
+    for campaign, (searched, as_given) in zip(measured, data.rows_of, strict=True):
+        posed = "position" in {*searched.columns} - {*campaign.columns}
+        if as_given or posed or data.record.domain != "gyro":
+            continue
+        for effect in model.effects:
+            for name in set(model.columns_needed(effect)) & set(campaign.columns):
+                refuse_missing(effect.label, name, campaign.columns[name], np.isfinite(campaign.columns["output"]))
+
+
+def _more_likely(found: Diagnosis, again: Diagnosis) -> bool:
+    """Whether the same outputs beside other reference rates leave less, by what further parameters are worth."""
+    left = np.column_stack([found.residual_after, again.residual_after])
+    left = left[np.isfinite(left).all(axis=1)]
+    left = left[(np.abs(left) < 6.0 * np.median(np.abs(left), axis=0).max()).all(axis=1)]  # single errors apart
+    gained = len(left) * np.log(np.divide(*np.sqrt(np.mean(left**2, axis=0))))
+    more = len(again.extended.model.slots()) - len(found.extended.model.slots())
+    return bool(gained > CLEARER + PARAMETER * more)
 
 
 def _finished(estimate: Estimate, ordinary: bool) -> Estimate:

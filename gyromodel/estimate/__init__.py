@@ -11,6 +11,7 @@ from gyromodel.estimate._fit import (
     make_filter,
     pad_columns,
     read_for_fit,
+    refuse_missing,
     whiten_columns,
 )
 from gyromodel.estimate._function import FunctionFit, fit_function
@@ -36,6 +37,7 @@ __all__ = [
     "noise_table",
     "pad_columns",
     "read_for_fit",
+    "refuse_missing",
     "two_stage",
     "validity_unit",
     "whiten_columns",

@@ -173,10 +173,15 @@ def check_covariates(record: Record, model: GyroModel) -> None:
     for effect in model.effects:
         # Several campaigns serve as the runs that none of them has a column of.
         for name in set(model.columns_needed(effect)) & set(record.signals):
-            bad = np.flatnonzero(~np.isfinite(np.asarray(record.signals[name])[: record.rows]) & record.present)
-            if len(bad):
-                some = ", ".join(str(i + 1) for i in bad[:5]) + ("…" if len(bad) > 5 else "")
-                raise ModelError(f"effect {effect.label} needs column {name}, which is NaN in data rows {some}")
+            refuse_missing(effect.label, name, np.asarray(record.signals[name])[: record.rows], record.present)
+
+
+def refuse_missing(label: str, name: str, values: np.ndarray, present: np.ndarray) -> None:
+    """Refuse values of a column that an effect needs which are missing where there is an output."""
+    bad = np.flatnonzero(~np.isfinite(values) & present)
+    if len(bad):
+        some = ", ".join(str(i + 1) for i in bad[:5]) + ("…" if len(bad) > 5 else "")
+        raise ModelError(f"effect {label} needs column {name}, which is NaN in data rows {some}")
 
 
 def given_ratios(record: Record, model: GyroModel) -> NoiseRatios | None:
