@@ -21,6 +21,7 @@ from tests.truth.verdicts import Score, allowed
 SIZES = (0.5, 1.0, 2.0, 3.0, 10.0)
 # Channels that a campaign measures, of those that unknown effects follow.
 MEASURED = ("temperature", "rate", "supply_voltage", "pressure")
+WALK = "noise_random_walk"
 TIMED_DRAWS = 2000  # of the calibration of a diagnosis that is timed
 HEAD = [
     "| row | measure | prototype | must | measured (95 % interval) | n | | goal |",
@@ -148,14 +149,19 @@ def _check(row: str, measure: str, must: str, measured: str, count: int, met: An
 
 def _false_extensions(nulls: list[study.Record]) -> list[str]:
     """How often something is said where nothing is hidden: pooled noises hide which designs are worse."""
-    kinds = {"noise with a walk": True, "noise without": False}
-    lines = ["| design | " + " | ".join(kinds) + " |", "|---|---|---|"]
-    for design in dict.fromkeys(r.case.design for r in nulls):
+    lines = [
+        "| design | noise without a walk | noise with a walk | of these, a set that holds the walk |",
+        "|---|---|---|---|",
+    ]
+    designs = list(dict.fromkeys(r.case.design for r in nulls))
+    for name, of in {d: [d] for d in designs} | {"**all**": designs}.items():
         cells = []
-        for walk in kinds.values():
-            of = [r.score for r in nulls if r.case.design == design and ("walk" in r.case.noise) == walk if r.score]
-            cells.append(f"{sum(s.detected for s in of)} of {len(of)}")
-        lines.append(f"| {design} | {' | '.join(cells)} |")
+        for walk in (False, True):
+            group = [r for r in nulls if r.case.design in of and ("walk" in r.case.noise) == walk]
+            said = [r.answer for r in group if r.score and r.score.detected and r.answer]
+            cells.append(f"{len(said)} of {len(group)}")
+        held = sum(WALK in answer.credible for answer in said)
+        lines.append(f"| {name} | {' | '.join(cells)} | {held} |")
     return lines
 
 
