@@ -154,7 +154,7 @@ def _false_extensions(nulls: list[study.Record]) -> list[str]:
         "|---|---|---|---|",
     ]
     designs = list(dict.fromkeys(r.case.design for r in nulls))
-    for name, of in {d: [d] for d in designs} | {"**all**": designs}.items():
+    for name, of in [*((d, [d]) for d in designs), ("**all**", designs)]:
         cells = []
         for walk in (False, True):
             group = [r for r in nulls if r.case.design in of and ("walk" in r.case.noise) == walk]
