@@ -71,7 +71,8 @@ def write_page(output: Path, whole: list[Kept]) -> None:
     lines = [
         "# Hidden-effect study",
         "",
-        f"{sum(map(len, parts.values()))} campaigns, by the engine {made} (a digest: `benchmarks/_kept.py`){other}.",
+        f"{sum(map(len, parts.values()))} campaigns, by the engine {made}{other} (digests: `benchmarks/_kept.py`; of",
+        "several, each made some of the parts).",
         "Made by",
         "",
         *commands,
