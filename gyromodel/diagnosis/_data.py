@@ -66,7 +66,7 @@ def read(measured: Sequence[Campaign], without: str = "") -> Data:
 
 def _of_gyro(measured: Sequence[Campaign]) -> Data:
     for campaign in measured:
-        if "output" not in campaign.columns:
+        if not campaign.outputs:
             named = ", ".join(GIMBALS)
             raise CampaignError(f"{campaign.name}: there is no column 'output', and a platform's gimbals are {named}")
     refuse_navigated(measured)
