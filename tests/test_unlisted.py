@@ -180,6 +180,7 @@ def test_a_thermometer_is_smoothed_where_its_noise_is_its_own_alone(rng: np.rand
         assert abs(slope.value - 0.01) < 5.0 * slope.std
     assert binom.cdf(told[True], 8, 0.75) > 1e-3
     assert binom.sf(told[False] - 1, 4, 0.1) > 1e-3
+    assert binom.sf(more - 1, 12, 0.01) > 1e-3, "a second cause"
 
 
 @pytest.mark.long

@@ -224,9 +224,10 @@ def diagnose(
     )
     if record.domain == "gyro" and measured[0].metadata["kind"] != "rate" and LATE & {c.effect for c in found.causes}:
         whole = [with_interval_rates(c) for c in measured]
-        again = diagnose(whole, model, hold_out=hold_out, calibrate=calibrate, seed=seed, progress=progress)
-        if _more_likely(found, again):
-            return replace(again, findings=(COUNTED, *again.findings))
+        with contextlib.suppress(EstimateError):  # what cannot be fitted beside those rates is no better there
+            again = diagnose(whole, model, hold_out=hold_out, calibrate=calibrate, seed=seed, progress=progress)
+            if _more_likely(found, again):
+                return replace(again, findings=(COUNTED, *again.findings))
     return found
 
 
