@@ -6,9 +6,9 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from gyromodel._checks import MISSING_STEP, NUMBERED
+from gyromodel._output_rate import rate_output
 from gyromodel.campaign import Campaign
 from gyromodel.numerics.stretches import GAP
-from gyromodel.signals import rate_output
 from gyromodel.units import factor, from_internal, is_angle
 
 MAXIMUM_ROWS = 20_000

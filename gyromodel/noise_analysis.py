@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float
 
 from gyromodel._checks import CampaignError
+from gyromodel._output_rate import rate_output, rate_scale
 from gyromodel.campaign import Campaign
 from gyromodel.noise import NOISE_UNITS as _STATED_UNITS
 from gyromodel.noise import Deviation, Estimator, IdentifiedNoise, deviation, identify_noise, with_gaps
-from gyromodel.signals import rate_output, rate_scale
 from gyromodel.units import UnitError, convertible, factor, internal_unit
 
 # A reference rate that changes by more (deg/s) is a test at speed.

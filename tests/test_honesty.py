@@ -10,6 +10,7 @@ import pytest
 from scipy.stats import chi2
 
 import gyromodel as gm
+from gyromodel._output_rate import rate_output
 from gyromodel.averages import average
 from gyromodel.diagnosis._data import read
 from gyromodel.diagnosis._isolation import settling_test
@@ -20,7 +21,7 @@ from gyromodel.estimate import fit_record
 from gyromodel.model import ModelError
 from gyromodel.model_files import read_model, write_model
 from gyromodel.noise import NoiseRatios
-from gyromodel.signals import rate_output, read_signals
+from gyromodel.signals import read_signals
 from tests.truth import noise
 
 ROWS = 240

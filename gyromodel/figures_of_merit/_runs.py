@@ -12,6 +12,7 @@ import numpy as np
 from scipy.stats import f as fisher
 
 from gyromodel._checks import MISSING_STEP
+from gyromodel._output_rate import rate_scale
 from gyromodel.campaign import Campaign
 from gyromodel.effects.drivers import Bias
 from gyromodel.estimate import Estimate, EstimateError, filter_of, fit_record, with_noise_intervals
@@ -29,7 +30,7 @@ from gyromodel.model import GyroModel
 from gyromodel.noise import deviation, with_gaps
 from gyromodel.noise_analysis import AT_REST
 from gyromodel.numerics.state_space import colour
-from gyromodel.signals import Record, rate_scale, read_signals
+from gyromodel.signals import Record, read_signals
 from gyromodel.units import UnitError, factor, internal_unit
 
 # A run counts as at one temperature, and runs as at the same one, within this (°C).
