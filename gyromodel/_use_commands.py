@@ -151,7 +151,7 @@ def batch(
 
     A campaign that cannot be read or fitted is a row with its reason, and the exit status is then 1.
     """
-    output = output if output.suffix else output.with_suffix(".parquet")
+    output = output if output.suffix or not output.name else output.with_suffix(".parquet")
     refuse_suffix(output, [".parquet"])
     refuse_overwriting(output, [model, Path(archive)])
     from gyromodel._archive_files import batch_to

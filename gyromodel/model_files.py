@@ -173,6 +173,8 @@ def _meant(place: Place, effect: Effect) -> str:
     declared = effect.declared()
     if len(declared) == 1:
         return next(iter(declared))
+    if isinstance(place.node, yaml.MappingNode):
+        place = place.mapping(("value", "std"), "value").get("value", place)
     unit = place.quantity()[1] if isinstance(place.node, yaml.ScalarNode) else ""
     suits = [name for name, each in declared.items() if unit and convertible(unit, each.unit)]
     if len(suits) != 1 and suits[:1] != ["coefficient"]:

@@ -27,7 +27,7 @@ def simulate(model: GyroModel, campaign: Campaign, seed: int = 0) -> Campaign:
         CampaignError: it is no campaign of one gyro.
         ModelError: the model misses a value or a column, or what it states of the noise is none.
     """
-    if any(name.startswith("gimbal_") for name in campaign.columns):
+    if not campaign.outputs and any(name.startswith("gimbal_") for name in campaign.columns):
         raise CampaignError(f"{campaign.name}: is of a platform, and a model is simulated for a gyro")
     if not campaign.outputs:
         campaign = campaign.with_column("output", np.arange(len(campaign), dtype=float), "deg/s")

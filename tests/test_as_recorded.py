@@ -184,17 +184,23 @@ def test_a_scale_factor_error_is_told_in_ppm(rng: np.random.Generator):
     assert " ppm" in sentence(found)
 
 
-@pytest.mark.parametrize("counted", [True, False])
-def test_increments_over_intervals_are_not_late(counted: bool, rng: np.random.Generator):
-    """Beside rates at the rows, whose product with the interval other increments are: both are what they should be."""
+@pytest.mark.parametrize("walk", [0.0, 5e-4])
+@pytest.mark.parametrize(("counted", "late"), [(True, 0.0), (False, 0.0), (False, 0.012)])
+def test_increments_over_intervals_are_not_late(counted: bool, late: float, walk: float, rng: np.random.Generator):
+    """Beside rates at the rows, whose product with the interval other increments are: a delay is none of half of it."""
     time = 0.01 * np.arange(1500)
-    rate = 10.0 * np.sin(4.4 * time) + 3.0 * np.cos(12.0 * time)
+    rate, then = (10.0 * np.sin(4.4 * t) + 3.0 * np.cos(12.0 * t) for t in (time, time - late))
     turned = -10.0 / 4.4 * np.cos(4.4 * time) + 3.0 / 12.0 * np.sin(12.0 * time)
-    output = (np.diff(turned, prepend=np.nan) if counted else 0.01 * rate) + 2e-5 * rng.standard_normal(1500)
+    output = np.diff(turned, prepend=np.nan) if counted else 0.01 * then
+    output = output + 2e-5 * rng.standard_normal(1500) + walk * np.cumsum(rng.standard_normal(1500))
     measured = campaign(output, 0.01, "deg", "increment", rate=rate)
     found = gm.diagnose(measured, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
-    assert found.verdict == "adequate"
-    assert any("counts over the interval" in line for line in found.findings) is counted
+    assert any("intervals were taken" in line for line in found.findings) is counted
+    if late:
+        delay = next(r for r in found.extended.table() if r.name == "delay")
+        assert abs(delay.value - 12.0) < 5.0 * delay.std
+    else:
+        assert not {"time_delay", "bandwidth"} & {*found.credible_set, *(c.effect for c in found.causes)}
 
 
 def test_a_value_that_a_mean_would_hide_is_refused():

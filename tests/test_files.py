@@ -433,7 +433,7 @@ def test_measured_data_load(measured_data: Callable[[str], Path], name: str):
 
 
 def test_chunks_of_zeros_that_a_writer_left_out_are_zeros(tmp_path: Path):
-    """As xarray writes whole numbers; a missing chunk of times, outputs or other measured values is damage."""
+    """As xarray writes whole numbers; a missing chunk of values with fractions is damage."""
     import xarray as xr
 
     columns = {"time": ("s", np.arange(5.0)), "run": ("1", np.zeros(5, int)), "output": ("deg/s", np.arange(5.0))}

@@ -568,6 +568,7 @@ def test_a_line_beside_the_curve_that_holds_it_is_left_to_the_curve(tmp_path: Pa
         ("{effect: bias_warmup, value: 3 deg/h}", "amplitude", 3 * np.pi / 180 / 3600),
         ("{effect: bias_warmup, value: 20 min, amplitude: 1 deg/h}", "time_constant", 1200.0),
         ("{effect: time_delay, value: 5 ms}", "delay", 0.005),
+        ("{effect: time_delay, value: {value: 5 ms, std: 1 ms}}", "delay", 0.005),
         ("{effect: bias_temperature_rate, value: 3600 deg/h/(degC/s)}", "coefficient", np.pi / 180),
     ],
 )

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from gyromodel._checks import listed
+from gyromodel._checks import CampaignError, listed
 from gyromodel.averages import with_interval_rates
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._calibrate import null_scores, threshold_of
@@ -31,11 +31,13 @@ from gyromodel.estimate import (
     Estimate,
     EstimateError,
     check_covariates,
+    filter_of,
     fit_record,
     refuse_missing,
+    whiten_columns,
     with_noise_intervals,
 )
-from gyromodel.model import GyroModel
+from gyromodel.model import GyroModel, ModelError
 from gyromodel.signals import with_columns_known
 from gyromodel.units import factor, from_internal
 
@@ -47,11 +49,15 @@ SMOOTHED = (
     "thermometer, which the model adds where it is applied to temperatures as they were read."
 )
 # What outputs counted over intervals seem to have beside reference rates at the ends of these; and by how many nats
-# the means of the rates must leave less, and that for each parameter more.
+# the means of the rates must be likelier, and that for each parameter more.
 LATE, CLEARER, PARAMETER = {"time_delay", "bandwidth"}, 2.0, 4.0
 COUNTED = (
     "The output counts over the interval before each row, and is late by half of it beside rates at its end: the means "
-    "of the reference rates over the intervals were taken, which leave no more."
+    "of the reference rates over the intervals were taken, which are likelier."
+)
+HALF = (
+    "The output may count over the interval before each row, and be late by half of it beside rates at its end: these "
+    "data do not say, and what was found would hold it."
 )
 
 
@@ -222,12 +228,13 @@ def diagnose(
         baseline=baseline,
         extended=extended,
     )
-    if record.domain == "gyro" and measured[0].metadata["kind"] != "rate" and LATE & {c.effect for c in found.causes}:
-        whole = [with_interval_rates(c) for c in measured]
-        with contextlib.suppress(EstimateError):  # what cannot be fitted beside those rates is no better there
-            again = diagnose(whole, model, hold_out=hold_out, calibrate=calibrate, seed=seed, progress=progress)
-            if _more_likely(found, again):
-                return replace(again, findings=(COUNTED, *again.findings))
+    if record.domain == "gyro" and (counted := _over_intervals(found, measured, model)):
+        whole, likelier = counted
+        if likelier > CLEARER:
+            again = diagnose(whole, model, hold_out=hold_out, calibrate=calibrate, seed=seed)
+            return replace(again, findings=(COUNTED, *again.findings))
+        if likelier > -CLEARER:
+            return replace(found, findings=(HALF, *found.findings))
     return found
 
 
@@ -242,14 +249,44 @@ def _refuse_missing(measured: Sequence[Campaign], data: Data, model: GyroModel) 
                 refuse_missing(effect.label, name, campaign.columns[name], np.isfinite(campaign.columns["output"]))
 
 
-def _more_likely(found: Diagnosis, again: Diagnosis) -> bool:
-    """Whether the same outputs beside other reference rates leave less, by what further parameters are worth."""
-    left = np.column_stack([found.residual_after, again.residual_after])
-    left = left[np.isfinite(left).all(axis=1)]
-    left = left[(np.abs(left) < 6.0 * np.median(np.abs(left), axis=0).max()).all(axis=1)]  # single errors apart
-    gained = len(left) * np.log(np.divide(*np.sqrt(np.mean(left**2, axis=0))))
-    more = len(again.extended.model.slots()) - len(found.extended.model.slots())
-    return bool(gained > CLEARER + PARAMETER * more)
+def _over_intervals(
+    found: Diagnosis, measured: Sequence[Campaign], model: GyroModel
+) -> tuple[list[Campaign], float] | None:
+    """Increments and angles beside means of the rates over their intervals, and by how many nats they are likelier so.
+
+    Asked where a delay or a bandwidth was found: those are what means have beside rates at the ends of intervals.
+    """
+    late = LATE & {c.effect for c in found.causes}
+    if not late or measured[0].metadata.get("kind") == "rate" or "rate" not in measured[0].columns:
+        return None
+    whole = [with_interval_rates(c) for c in measured]
+    try:
+        again = diagnose(whole, model, hold_out=False)
+    except (CampaignError, EstimateError, ModelError):
+        return None
+    return whole, _likelier(found.extended, again.extended)
+
+
+def _likelier(one: Estimate, other: Estimate) -> float:
+    """By how many nats another fit of the same outputs is likelier, less what further parameters are worth.
+
+    Each in the noise of either, on the rows that both have.
+    """
+    if one.record.rows != other.record.rows:
+        return -np.inf
+    lacking = np.flatnonzero(~(one.record.present & other.record.present))
+    best = []
+    for estimate in (one, other):
+        record = estimate.record.without(lacking)
+        left = record.signals["output"] - estimate.model.predict(record.signals)
+        each = []
+        for ratios in (one.ratios, other.ratios):
+            filter = filter_of(record, ratios)
+            squares = float(np.sum(np.asarray(whiten_columns(filter, left[:, None])) ** 2))
+            each.append(-0.5 * (record.present.sum() * np.log(squares) + float(filter.log_determinant)))
+        best.append(max(each))
+    more = len(other.model.slots()) - len(one.model.slots())
+    return best[1] - best[0] - PARAMETER * more
 
 
 def _finished(estimate: Estimate, ordinary: bool) -> Estimate:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
-from gyromodel.estimate._estimate import Estimate, noise_coefficients
+from gyromodel.estimate._estimate import Estimate, EstimateError, noise_coefficients
 from gyromodel.model import GyroModel
 from gyromodel.noise import NoiseRatios, markov_cells, noise_grid, restricted_likelihood
 from gyromodel.signals import Record
@@ -37,6 +37,8 @@ def best_ratios(
     It is flicker and walk, unless a Markov process beside white noise is likelier by a margin.
     """
     predicted, jacobian = model.linearise(record.signals)
+    if not np.isfinite(jacobian).all():
+        raise EstimateError("the fit ran to where the model has no value")
     residual = np.where(record.sampling.present, np.asarray(record.signals["output"]) - predicted, 0.0)
     span = record.span
 
