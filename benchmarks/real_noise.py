@@ -23,7 +23,7 @@ from tests.truth.campaigns import TESTABLE, A, B, C
 from tests.truth.designs import Design
 from tests.truth.levels import Level
 from tests.truth.noise import Noise
-from tests.truth.verdicts import Score, judge
+from tests.truth.verdicts import Score, allowed, judge
 
 # File, and the axis of it; none: its only one.
 LOGS = {
@@ -107,6 +107,14 @@ def _share(flags: list[bool]) -> str:
     return f"{level.count} of {level.total} ({low:.0f}-{high:.0f} %)"
 
 
+def _beside_dither(record: study.Record) -> bool | None:
+    """Of an answer that is unknown in the noise of a dither, whether what it names is right; none of others."""
+    answer = record.answer
+    if answer is None or answer.verdict != "unknown" or "rlg" not in record.case.noise:
+        return None
+    return len(answer.causes) == 1 and answer.causes[0] in allowed(str(record.case.effect), record.case.design)[0]
+
+
 def main(argv: list[str] | None = None) -> None:
     argv = sys.argv[1:] if argv is None else argv
     parser = argparse.ArgumentParser(description="Effects hidden in the noise of real gyros.")
@@ -132,11 +140,14 @@ def main(argv: list[str] | None = None) -> None:
             alone = [s.named for r, s in zip(records, scores, strict=True) if r.isolable]
             rows.append([f"{times:g}×, isolable: named, and nothing else", _share(alone)])
             rows.append([f"{times:g}×: firm and wrong", _share([s.firm_and_wrong for s in scores])])
+            beside = [_beside_dither(r) for r in records]
+            rows.append([f"{times:g}×: unknown, in the ring laser's log", _share([b is not None for b in beside])])
+            rows.append([f"{times:g}×: of these, the right name and no other stands beside", str(beside.count(True))])
         for r, s in zip(records, scores, strict=True):
             if r.answer and (s.firm_and_wrong or (times is None and s.detected)):
                 said = f"{r.answer.verdict}: {', '.join(r.answer.causes or r.answer.driver)}"
                 wrong.append([r.case.noise, r.case.design, str(r.case.effect), f"{times or 0:g}", said])
-        print(*rows[-3:], sep="\n", flush=True)
+        print(*rows[-5:], sep="\n", flush=True)
     lines = [
         f"{len(logs)} series of static logs (a MEMS triad twice for 10 000 s, a dithered ring laser triad for 300 s,",
         "a closed-loop fiber-optic gyro for 180 s), averaged to the rows of three simulated designs",

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import gyromodel as gm
+from gyromodel._checks import CampaignError
 from gyromodel.compensation import compensate
 from gyromodel.diagnosis._causes import _told
 from gyromodel.diagnosis._data import read
@@ -16,7 +17,7 @@ from gyromodel.effects.drivers import Bias, BiasPeriodic, BiasStep
 from gyromodel.effects.power_cycles import BiasTurnOn
 from gyromodel.effects.scale import ScaleFactor
 from gyromodel.effects.thermometer import TemperatureLag
-from gyromodel.estimate import Calibration, fit_record
+from gyromodel.estimate import Calibration, fit, fit_record
 from gyromodel.model import GyroModel, ModelError, model_from_effects
 from gyromodel.report import sentence
 from gyromodel.signals import read_signals, with_columns_known
@@ -217,3 +218,6 @@ def test_a_column_of_some_campaigns_is_not_searched(rng: np.random.Generator):
     assert "heater is in only some of the campaigns: it was not searched." in data.findings
     assert "heater" not in data.record.signals
     assert "heater" not in data.whole.columns
+    for asked in (fit, gm.diagnose):
+        with pytest.raises(CampaignError, match="campaign: lacks column heater, which effect bias_heater needs"):
+            asked([first, second], model_from_effects(["bias", "bias_heater"]))

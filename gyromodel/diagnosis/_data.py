@@ -107,7 +107,11 @@ def _of_gyro(measured: Sequence[Campaign]) -> Data:
     findings += [line for c in given for line in thermometers_still(c)]
     searched = tuple(c for c, _ in shortened)
     record = read_signals(searched)
-    findings += [f"{n} is in only some of the campaigns: it was not searched." for n in columns_apart(searched)]
+    findings += [
+        f"{n} is in only some of the campaigns: it was not searched."
+        for n in columns_apart(searched)
+        if n != "campaign"
+    ]
     if any(m > 1 for _, m in shortened):
         record = _of_means(record, campaigns, searched)
     if "run" in searched[0].columns and "run" not in as_given[0].columns:

@@ -33,6 +33,7 @@ from gyromodel.estimate import (
     check_covariates,
     filter_of,
     fit_record,
+    refuse_apart,
     refuse_missing,
     whiten_columns,
     with_noise_intervals,
@@ -93,6 +94,8 @@ def diagnose(
     measured = [campaigns] if isinstance(campaigns, Campaign) else list(campaigns)
     data = read(measured)
     record, findings, unit = data.record, list(data.findings), data.unit
+    if record.domain == "gyro":
+        refuse_apart(measured, model)
     check_covariates(record, model)
     _refuse_missing(measured, data, model)
     record, left_out = with_columns_known(record)

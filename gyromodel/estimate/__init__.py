@@ -11,6 +11,7 @@ from gyromodel.estimate._fit import (
     make_filter,
     pad_columns,
     read_for_fit,
+    refuse_apart,
     refuse_missing,
     whiten_columns,
 )
@@ -37,6 +38,7 @@ __all__ = [
     "noise_table",
     "pad_columns",
     "read_for_fit",
+    "refuse_apart",
     "refuse_missing",
     "two_stage",
     "validity_unit",

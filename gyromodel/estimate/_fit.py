@@ -59,7 +59,9 @@ def fit(
         EstimateError: the campaign does not determine some combination of parameters, or the fit did not converge.
         ModelError: the model needs columns the campaign lacks.
     """
-    record = read_for_fit([campaigns] if isinstance(campaigns, Campaign) else campaigns)
+    given = [campaigns] if isinstance(campaigns, Campaign) else campaigns
+    record = read_for_fit(given)
+    refuse_apart(given, model)
     if progress:
         progress("fitting", 0.1)
     estimate = with_noise_intervals(fit_record(record, model, solver=solver))
@@ -174,6 +176,15 @@ def check_covariates(record: Record, model: GyroModel) -> None:
         # Several campaigns serve as the runs that none of them has a column of.
         for name in set(model.columns_needed(effect)) & set(record.signals):
             refuse_missing(effect.label, name, np.asarray(record.signals[name])[: record.rows], record.present)
+
+
+def refuse_apart(campaigns: Sequence[Campaign], model: GyroModel) -> None:
+    """Refuse a campaign that lacks a column which an effect needs and another has; rates may come from an attitude."""
+    for effect in model.effects:
+        for name in (n for n in model.columns_needed(effect) if n.partition("_")[0] != "rate"):
+            lacking = [c.name for c in campaigns if name not in c.columns]
+            if 0 < len(lacking) < len(campaigns):
+                raise CampaignError(f"{lacking[0]}: lacks column {name}, which effect {effect.label} needs")
 
 
 def refuse_missing(label: str, name: str, values: np.ndarray, present: np.ndarray) -> None:
