@@ -16,6 +16,7 @@ SITES = {
     "scale": "Terms of the scale-factor error ε",
     "rate": "Terms added to the input rate: bias, and what drives it",
     "output": "Terms added to what all others come to",
+    "readout": "How the output is read, noise and all",
     "angle": "Of a platform's vibration test: terms of the base's angle less that of the table",
 }
 HEAD = """# The effect catalogue
@@ -66,6 +67,8 @@ def _entry(entry: Declaration) -> str:
 def _unit(entry: Declaration, parameter: ParameterDeclaration) -> str:
     if entry.site == "gain":
         return "the output's, per deg/s"
+    if entry.site == "readout":
+        return "the output's"
     return "–" if parameter.unit == "1" else parameter.unit
 
 

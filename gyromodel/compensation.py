@@ -23,7 +23,7 @@ from gyromodel.averages import MEAN_OF_ATTITUDE, average
 from gyromodel.campaign import Campaign
 from gyromodel.effects import Signals
 from gyromodel.effects.power_cycles import BiasTurnOn, cycles
-from gyromodel.estimate import Calibration, check_covariates, validity_unit
+from gyromodel.estimate import Calibration, check_covariates, step_of, validity_unit
 from gyromodel.model import GyroModel, ModelError, check_domain, check_units
 from gyromodel.signals import Record, read_signals
 from gyromodel.units import from_internal
@@ -162,6 +162,8 @@ def _estimate(calibration: Calibration, record: Record) -> tuple[np.ndarray, np.
     signals = {name: values for name, values in record.signals.items() if name in names}
     output = jnp.where(record.sampling.present, record.signals["output"], jnp.nan)
     white = jnp.asarray(model.noise.get("noise_white", 0.0)) ** 2 / record.interval
+    if model.noise:
+        white += (step_of(model, record) / model.gain()) ** 2 / 12.0  # of rounding
     spread = np.zeros((len(model.slots()),) * 2) if covariance is None else covariance
     # The whole record at once: effects may look at what came before.
     found = _solve(model, jnp.asarray(spread), white, signals, output)

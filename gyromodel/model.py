@@ -19,6 +19,7 @@ from gyromodel._checks import of_usual_unit, usual_unit
 from gyromodel.declarations import column_of
 from gyromodel.effects import CATALOGUE, Effect, Signals
 from gyromodel.effects._base import Domain, evaluate, lacking
+from gyromodel.effects.converter import Quantisation
 from gyromodel.effects.drivers import BiasColumn
 from gyromodel.noise import NOISE_UNITS
 from gyromodel.signals import domain_of
@@ -26,8 +27,9 @@ from gyromodel.units import convertible
 
 # A local slope below this part of the gain is a dead band's.
 DEAD = 0.05
-# Sites of terms that are added to the input.
+# Sites of terms that are added to the input, and of what depends on all that other effects add up to.
 ADDED = ("rate", "angle")
+LATER = ("gain", "output", "readout")
 OF = {"gyro": "a gyro", "platform": "a platform's base in a vibration test"}
 
 
@@ -195,6 +197,11 @@ class GyroModel(eqx.Module):
         _, rate, scale = self._sites(signals)
         return np.asarray(self.passed(rate * scale, signals)) == 0.0
 
+    @property
+    def reading(self) -> Quantisation | None:
+        """How the output is read; None where in steps that nobody sees."""
+        return next((e for e in self.effects if isinstance(e, Quantisation)), None)
+
     def gain(self) -> Float[Array, ""]:
         """Output per unit of input rate."""
         values = [e.value for e in self.effects if e.site == "gain"]  # type: ignore[attr-defined]
@@ -233,7 +240,7 @@ class GyroModel(eqx.Module):
         return {
             i: np.asarray(evaluate(effect, signals)[0])
             for i, effect in enumerate(self.effects)
-            if effect.site not in ("gain", "output") and all(each.linear for each in effect.declared().values())
+            if effect.site not in LATER and all(each.linear for each in effect.declared().values())
         }
 
     def linearise(
@@ -247,7 +254,7 @@ class GyroModel(eqx.Module):
         scale = 1.0 + 0.0 * rate
         pieces: dict[int, Any] = {}
         for i, effect in enumerate(self.effects):
-            if effect.site in ("gain", "output"):
+            if effect.site in LATER:
                 continue
             if steady is not None and i in steady:
                 pieces[i] = [steady[i], steady[i][:, :0], steady[i] @ on_host(effect.linear())]
@@ -320,7 +327,12 @@ def model_from_effects(labels: Iterable[str], gyro: str = "") -> GyroModel:
 
 
 def parameter_unit(effect: Effect, field: str, output_unit: str, units: Mapping[str, str]) -> str:
-    """The unit a parameter is reported in; a gain's follows the output, a linear driver's its column (file units)."""
+    """The unit a parameter is reported in.
+
+    A gain's and a readout's follow the output, a linear driver's its column (file units).
+    """
+    if effect.site == "readout":
+        return "deg/s" if output_unit == "rad/s" else output_unit
     if effect.site == "gain":
         if output_unit == "rad/s":
             return "1"
@@ -358,14 +370,15 @@ def check_units(model: GyroModel, output_unit: str, units: Mapping[str, str]) ->
         if not written:
             continue
         name = next(iter(effect.declared()))
+        what = f"the output is in [{output_unit}]"
         accepted = [parameter_unit(effect, name, output_unit, units)]
-        what = (
-            f"column {effect.column} is in [{units.get(effect.column, '')}]" if isinstance(effect, BiasColumn) else ""
-        )
+        if isinstance(effect, BiasColumn):
+            what = f"column {effect.column} is in [{units.get(effect.column, '')}]"
         if effect.site == "gain":
-            what = f"the output is in [{output_unit}]"
             raw = output_unit.removesuffix("/s")
             accepted = [f"{raw}/deg", f"{raw}/(deg/s)"] if raw in ("count", "bit") else accepted
+        if effect.site == "readout":  # of increments and angles it is the angle that is read
+            accepted = [output_unit, output_unit.removesuffix("/s")]
         if not any(convertible(written, unit) for unit in accepted):
             given = "a plain number" if written == "1" else f"in {written}"
             expected = " or ".join("a plain number" if unit == "1" else unit for unit in accepted)

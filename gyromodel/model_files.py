@@ -213,6 +213,9 @@ def _read_parameter(place: Place, effect: Effect, name: str) -> dict[str, Any]:
         if value == 0:
             raise place.error("a scale factor cannot be zero")
         return {name: value, "unit": place.quantity()[1] or "1"}
+    if effect.site == "readout":
+        value, unit = place.quantity()
+        return {name: value, "unit": unit or "1"}
     if isinstance(effect, BiasColumn):
         value, unit = place.quantity()
         return {name: value, "unit": unit or ("1" if value else "")}
@@ -358,7 +361,7 @@ def _unit_of(effect: Effect, name: str, record: Record | None) -> str:
     """The unit a parameter is written in; before a fit, one that depends on the campaign is the one it was read in."""
     if record:
         return parameter_unit(effect, name, record.output_unit, record.units)
-    if effect.site == "gain" or isinstance(effect, BiasColumn):
+    if effect.site in ("gain", "readout") or isinstance(effect, BiasColumn):
         return getattr(effect, "unit", "")
     return effect.declared()[name].unit
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Any, get_args
 
 import numpy as np
-from jaxtyping import Float
 
 from gyromodel._checks import CampaignError
 from gyromodel._output_rate import rate_output, rate_scale
 from gyromodel.campaign import Campaign
 from gyromodel.noise import NOISE_UNITS as _STATED_UNITS
 from gyromodel.noise import Deviation, Estimator, IdentifiedNoise, deviation, identify_noise, with_gaps
+from gyromodel.numerics.rounding import quantum
 from gyromodel.units import UnitError, convertible, factor, internal_unit
 
 # A reference rate that changes by more (deg/s) is a test at speed.
@@ -21,9 +21,6 @@ AT_REST = 0.01
 # Averages that end below this part of the longest possible are said to.
 SHORTENED = 0.25
 LENGTHS_PER_DECADE = 10
-# Values closer than this part of the largest are one, rounded in two ways; values of a grid lie on it to this part of a
-# step.
-ROUNDED, OFF_GRID = 1e-9, 0.05
 RATE_UNIT = "deg/h"
 # Units of the coefficients of an angular rate, and for any other output what the rate's unit is multiplied by.
 UNITS = _STATED_UNITS | {
@@ -193,28 +190,6 @@ def analyse_noise(campaign: Campaign, progress: Callable[[str, float], None] | N
         remarks.append(f"The output comes in steps of {step:.4g} {campaign.units['output']}.")
     shown = RATE_UNIT if unit == "rad/s" else unit
     return NoiseAnalysis(campaign.name, deviations, noise, unit, shown, tuple(remarks), campaign.digest(), step)
-
-
-def quantum(values: Float[np.ndarray, " sample"]) -> float | None:
-    """The step of the grid that all values lie on; None without one, or where it is too fine for so few values to show.
-
-    Args:
-        values: in any unit; NaN where missing.
-    """
-    levels = np.unique(values[np.isfinite(values)])
-    apart = np.diff(levels)
-    apart = apart[apart > ROUNDED * np.abs(levels).max(initial=0.0)]
-    if not len(apart):
-        return None
-    # Each difference is a whole number of steps, so that dividing by that number tells the step ever better.
-    step = float(apart.min())
-    for reach in np.sort(apart):
-        step = reach / round(reach / step)
-    places = (levels - levels[0]) / step
-    step *= float(places[-1] / round(places[-1]))
-    places = (levels - levels[0]) / step
-    on_grid = np.abs(places - np.round(places)).max() < OFF_GRID
-    return step if on_grid and places[-1] < np.isfinite(values).sum() else None
 
 
 def _nominal(campaign: Campaign, unit: str) -> float | None:

@@ -30,6 +30,6 @@ def test_every_entry_is_complete():
         assert entry.equation, entry.id
         assert entry.cause, entry.id
         assert entry.test, entry.id
-        assert entry.site in ("gain", "scale", "rate", "output", "angle"), entry.id
+        assert entry.site in ("gain", "scale", "rate", "output", "readout", "angle"), entry.id
         assert entry.parameters, entry.id
         assert all(parameter.meaning for parameter in entry.parameters), entry.id

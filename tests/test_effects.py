@@ -144,7 +144,7 @@ def test_declarations_are_complete(label: str):
     assert re.search(r"[=≡]", equation), "the docstring opens with the equation"
     for sentence in (effect.cause, effect.test):
         assert re.fullmatch(r"[A-Z].{15,}\.", sentence)
-    assert effect.site in ("gain", "scale", "rate", "output")
+    assert effect.site in ("gain", "scale", "rate", "output", "readout")
     for name, declared in effect.declared().items():
         assert declared.meaning
         assert declared.typical > 0
@@ -445,7 +445,7 @@ def test_equation_by_hand(label: str, fields: dict[str, str], columns: dict[str,
 
 
 def test_every_effect_is_worked_by_hand():
-    assert {row[0] for row in BY_HAND} | {"scale_factor", "scale_spline"} == set(LABELS)
+    assert {row[0] for row in BY_HAND} | {"scale_factor", "scale_spline", "quantisation"} == set(LABELS)
 
 
 @eqx.filter_jit
@@ -493,6 +493,7 @@ def test_reference_points_ignore_missing_values(rng: np.random.Generator):
 
 def test_prepared_keeps_what_is_set(rng: np.random.Generator):
     signals = signals_of(rng)
+    signals["output"] = jnp.round(100.0 * signals["rate"]) / 64.0
     once = [make_effect(label).prepared(signals) for label in LABELS]
     moved = {k: 2 * v + 1 for k, v in signals.items()}
     for effect in once:

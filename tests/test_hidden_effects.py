@@ -53,6 +53,7 @@ HIDDEN_BY = {
     "lock_in": "test_ring_laser.py::test_diagnosis_names_lock_in_and_nothing_without_it",
     # It is fitted and not searched, as no column tells the dither.
     "lock_in_dithered": "test_ring_laser.py::test_fit_finds_the_lock_in_rate_behind_a_dither",
+    "quantisation": "test_quantisation.py::test_coarse_steps_are_named_and_nothing_else",
     "saturation": "test_memory_effects.py::test_a_clipped_output_is_saturation",
     "temperature_lag": "test_memory_effects.py::test_a_late_thermometer_under_a_curved_bias_is_named_with_its_delay",
     "thermometer_error": "test_temperature_curves.py::test_the_same_ripple_in_bias_and_scale_factor_is_the_thermistor",

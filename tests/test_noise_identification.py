@@ -15,9 +15,10 @@ from gyromodel.noise import _reduced as reduction
 from gyromodel.noise._identify import KINDS
 from gyromodel.noise._lines import find_lines
 from gyromodel.noise._reduced import Mixture
-from gyromodel.noise_analysis import analyse_noise, quantum
+from gyromodel.noise_analysis import analyse_noise
 from gyromodel.numerics.markov_cells import MarkovCells, Rows, log_determinant_and_gram
 from gyromodel.numerics.maximise import maximise
+from gyromodel.numerics.rounding import quantum
 from tests.truth import noise as truth
 
 RARE = 1e-5

@@ -143,6 +143,8 @@ def build_bank(record: Record) -> Bank:
     for name, kind in sorted(CATALOGUE.items()):
         if kind.domain != record.domain:
             continue
+        if kind.site == "readout":
+            continue
         if name == "bias_column" or (kind.site == "gain" and "rate" not in signals):
             if name != "bias_column":
                 not_testable[name] = "needs a column rate"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +12,7 @@ from gyromodel._checks import CampaignError
 from gyromodel.attitude import refuse_navigated, with_reference_rates
 from gyromodel.averages import MEAN_OF_ATTITUDE, MOST_TURN, as_rate, average, turning
 from gyromodel.campaign import Campaign
+from gyromodel.diagnosis._readings import Readings, readings_of
 from gyromodel.diagnosis._variance import steps_of_output, stretch_still, thermometers_still
 from gyromodel.numerics.stretches import stretches_of
 from gyromodel.platform import GIMBALS, is_platform, vibration_record
@@ -38,6 +39,8 @@ class Data:
         unit: that errors are told in.
         output_unit: that of the output as it was recorded, a rate or of a platform an angle.
         step: of the coarsest reading that the output is computed from, internal units; zero where none shows.
+        readings: how a gyro's output is read.
+        stepped: findings on that, for where its steps are no cause.
     """
 
     record: Record
@@ -48,6 +51,8 @@ class Data:
     unit: str
     output_unit: str
     step: float = 0.0
+    readings: Readings = field(default_factory=Readings)
+    stepped: tuple[str, ...] = ()
 
 
 def read(measured: Sequence[Campaign], without: str = "") -> Data:
@@ -103,7 +108,8 @@ def _of_gyro(measured: Sequence[Campaign]) -> Data:
         for g, (c, m) in zip(campaigns, shortened, strict=True)
         if m == 1 and len(c) < len(g)
     ]
-    findings += [line for of in (steps_of_output, stretch_still) for c in given if (line := of(c))]
+    findings += [line for c in given if (line := stretch_still(c))]
+    stepped = tuple(line for c in given if (line := steps_of_output(c)))
     findings += [line for c in given for line in thermometers_still(c)]
     searched = tuple(c for c, _ in shortened)
     record = read_signals(searched)
@@ -121,7 +127,9 @@ def _of_gyro(measured: Sequence[Campaign]) -> Data:
         output_unit = f"{output_unit}/s"
     whole = searched[0] if len(searched) == 1 else _together(searched)
     rows_of = tuple((c, len(c) == len(m)) for c, m in zip(searched, measured, strict=True))
-    return Data(record, searched, rows_of, whole, tuple(findings), _rate_unit(campaigns[0]), output_unit)
+    readings = readings_of(campaigns, searched)
+    unit = _rate_unit(campaigns[0])
+    return Data(record, searched, rows_of, whole, tuple(findings), unit, output_unit, 0.0, readings, stepped)
 
 
 def _without_power_cycles(record: Record, campaign: Campaign) -> Record:

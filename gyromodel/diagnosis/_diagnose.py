@@ -22,11 +22,18 @@ from gyromodel.diagnosis._points import dwells_apart
 from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, cells_of_weight, is_driver, is_noise, noise_kinds
 from gyromodel.diagnosis._result import Candidate, Cause, Diagnosis, Gain, ParameterValue, Round
 from gyromodel.diagnosis._search import Progress, Selection
-from gyromodel.diagnosis._session import Session, laid_out, over_smooth_thermometers, over_weighted, without_axis
+from gyromodel.diagnosis._session import (
+    Session,
+    laid_out,
+    over_smooth_thermometers,
+    over_unrounded,
+    over_weighted,
+    without_axis,
+)
 from gyromodel.diagnosis._shapes import driver_shape, minimum_detectable, not_testable
 from gyromodel.diagnosis._steps import Found
 from gyromodel.diagnosis._variance import follow, growing_noise, noise_level, tails
-from gyromodel.diagnosis._verdict import FAINT, judge, structured, with_noise
+from gyromodel.diagnosis._verdict import FAINT, judge, structured, with_noise, with_steps
 from gyromodel.estimate import (
     Estimate,
     EstimateError,
@@ -37,12 +44,15 @@ from gyromodel.estimate import (
     refuse_missing,
     whiten_columns,
     with_noise_intervals,
+    with_reading,
 )
 from gyromodel.model import GyroModel, ModelError
 from gyromodel.signals import with_columns_known
 from gyromodel.units import factor, from_internal
 
 FEWEST_DRAWS = 200
+# Searches beside rounding as it is at what the last has found.
+ROUNDINGS = 3
 # Folds search the noise cells within this many nats of the best of the main pass.
 FOLD_NEARBY = 3.0
 SMOOTHED = (
@@ -101,17 +111,32 @@ def diagnose(
     record, left_out = with_columns_known(record)
     findings += left_out
     say("fitting the simulation", 0.02)
+    readings, given = data.readings, model
+    model, reading = readings.bare(given, record)
     session = laid_out(record, model, step=data.step)
+    if readings.coarse_beside(session.baseline) and _quantised_angle(session.baseline, session.threshold):
+        readings = replace(readings, step=0.0)
+    session = over_unrounded(record, session.baseline, model, readings) or session
     nulls = np.zeros(0)
     if calibrate:
         nulls = null_scores(session.scanner, session.baseline, calibrate, seed, say)
         session.threshold = max(threshold_of(nulls), 0.0)
     selection = session.run(say)
+    for _ in range(ROUNDINGS if selection.found else 0):
+        # Rounding is another beside what was found.
+        again = over_unrounded(record, selection.estimate, model, readings, session.threshold)
+        if again is None:
+            break
+        names, session, selection = [f.name for f in selection.found], again, again.run(say)
+        if [f.name for f in selection.found] == names:
+            break
     if record.domain == "gyro" and (others := over_smooth_thermometers(session, selection, model, say)):
         session, selection = others
         findings.append(SMOOTHED)
     beyond: list[Cause] = []
-    grows, following = growing_noise(session.record, selection.estimate), None
+    # What rounding leaves is larger at edges of steps.
+    even = readings.beside(record, selection.estimate).saw_tooth == 0.0
+    grows, following = growing_noise(session.record, selection.estimate) if even else None, None
     others = over_weighted(session, grows.white, model, say) if grows else None
     grows = grows if others else None
     if grows and others:
@@ -137,7 +162,7 @@ def diagnose(
                 f"Runs about {failed[0]} were left out: with them {moves}, without them all is explained. A shaft that "
                 "sticks makes such an axis."
             )
-    record, baseline = session.record, session.baseline
+    as_it_was, record, baseline = record, session.record, session.baseline
     free = _with_noise_estimated(selection.estimate)
     hops = telegraph(baseline, free, unit) if free and record.domain == "gyro" and _like_hops(selection, free) else None
     if hops is not None:
@@ -151,7 +176,10 @@ def diagnose(
         selection = session.pruned(selection)
     findings += [selection.unresolved] if selection.unresolved else []
     last = selection.estimate
-    findings += [line for line in (tails(last), noise_level(last), dwells_apart(last, unit)) if line]
+    rounding = readings.beside(as_it_was, last)
+    # Of edges of steps there is much more than that to tell.
+    left = () if rounding.saw_tooth else (tails(last), dwells_apart(last, unit))
+    findings += [line for line in (*left, noise_level(last)) if line]
     stated, slope = float(model.gain()), float(last.model.gain())
     if slope * (stated if np.isfinite(stated) else 1.0) < 0:
         findings.append(
@@ -164,17 +192,19 @@ def diagnose(
     ordinary = tuple(hold_out and session.ladder(e)[2] for e in (baseline, selection.estimate))
     extended = _finished(selection.estimate, ordinary[1])
     weights = ordinary[0], extended.ordinary
+    extended = readings.widened(as_it_was, extended, rounding)
     if extended.ordinary:
         findings.append(
             "Parameters weigh all samples alike: that predicts left-out blocks better than the fitted noise's weights "
             "do."
         )
-    judgement = judge(session.steps, selection, extended, len(names), nulls, data.rows_of)
+    judgement = judge(session.steps, selection, extended, len(names), nulls, data.rows_of, rounding.saw_tooth)
     # What follows itself at one end of a column has structure, whatever faint name takes a part of it.
     if following and grows and all(c.statistic < FAINT for c in judgement.causes):
         judgement = structured(judgement, selection.last, grows.column)
     stepped = None
-    if record.domain == "gyro" and not selection.unfinished and (free := _with_noise_estimated(selection.estimate)):
+    plain = record.domain == "gyro" and not rounding.saw_tooth
+    if plain and not selection.unfinished and (free := _with_noise_estimated(selection.estimate)):
         stepped = quantisation(free, session.threshold)
     if stepped is not None:
         beyond.append(stepped)
@@ -183,7 +213,7 @@ def diagnose(
             f"The noise from sample to sample is in part that of quantisation, {size:.3g} arcsec (white noise of the "
             "angle); fits take it as white noise of the rate."
         )
-    elif record.domain == "gyro" and not selection.unresolved and (band := excess_band(selection.estimate)):
+    elif plain and not selection.unresolved and (band := excess_band(selection.estimate)):
         findings.append(band)
     # Where the simulation leaves its noise to be estimated, its kinds are no discrepancy, but for what no fit holds.
     judgement = with_noise(
@@ -191,6 +221,17 @@ def diagnose(
         beyond if baseline.noise_given else [c for c in beyond if c is hops],
         len(names),
     )
+    coarse = readings.coarse(extended, rounding)
+    if coarse:
+        if not readings.same_as(reading):
+            judgement = with_steps(judgement, readings.as_cause(int(record.present.sum())))
+        findings.append(readings.told(rounding))
+    else:
+        findings += data.stepped
+    if coarse or reading:
+        extended = with_reading(extended, readings.as_effect() if coarse or reading is None else reading, given)
+    if reading:
+        baseline = with_reading(baseline, reading, given)
     next_test = judgement.next_test
     if judgement.verdict == "ambiguous":
         alike = list(judgement.credible_set)
@@ -203,6 +244,8 @@ def diagnose(
     slopes = [np.asarray(e.model.slope(record.signals))[: record.rows] for e in (baseline, extended)]
     output = np.where(record.present, np.asarray(record.signals["output"])[: record.rows], np.nan)
     sizes = minimum_detectable(session.scanner, selection.last, session.threshold, unit)
+    if readings.unit and not coarse:
+        sizes["quantisation"] = readings.least(extended), readings.unit
     found = Diagnosis(
         verdict=judgement.verdict,
         causes=judgement.causes,
@@ -221,7 +264,11 @@ def diagnose(
         threshold=session.threshold + _more_needed(rankings[0], selection.path),
         threshold_kind="calibrated" if calibrate else "safe",
         p_value=_p_value(selection, nulls) if calibrate else None,
-        searched=tuple(dict.fromkeys([*names, *(name for r in rankings for name in r.tangents)])),
+        searched=tuple(
+            dict.fromkeys(
+                [*names, *(name for r in rankings for name in r.tangents), *["quantisation"] * bool(readings.unit)]
+            )
+        ),
         campaign=data.whole,
         predicted_before=from_internal(before, data.output_unit),
         predicted_after=from_internal(after, data.output_unit),
@@ -231,14 +278,20 @@ def diagnose(
         baseline=baseline,
         extended=extended,
     )
-    if record.domain == "gyro" and (counted := _over_intervals(found, measured, model)):
+    if record.domain == "gyro" and (counted := _over_intervals(found, measured, given)):
         whole, likelier = counted
         if likelier > CLEARER:
-            again = diagnose(whole, model, hold_out=hold_out, calibrate=calibrate, seed=seed)
+            again = diagnose(whole, given, hold_out=hold_out, calibrate=calibrate, seed=seed)
             return replace(again, findings=(COUNTED, *again.findings))
         if likelier > -CLEARER:
             return replace(found, findings=(HALF, *found.findings))
     return found
+
+
+def _quantised_angle(estimate: Estimate, threshold: float) -> bool:
+    """Whether it is the angle that is rounded, and not each rate for itself."""
+    free = _with_noise_estimated(estimate)
+    return free is not None and quantisation(free, threshold) is not None
 
 
 def _refuse_missing(measured: Sequence[Campaign], data: Data, model: GyroModel) -> None:

@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 from gyromodel.diagnosis._evidence import log_sum
 from gyromodel.diagnosis._result import Cause, ParameterValue
 from gyromodel.estimate import Estimate, filter_of
-from gyromodel.noise_analysis import quantum
+from gyromodel.numerics.rounding import quantum
 from gyromodel.signals import Record
 from gyromodel.units import factor
 

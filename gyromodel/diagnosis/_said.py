@@ -28,10 +28,11 @@ ROWS_TOLD = 12
 
 
 def told(
-    steps: Steps, selection: Selection, extended: Estimate, searched: Sequence[tuple[Campaign, bool]]
+    steps: Steps, selection: Selection, extended: Estimate, searched: Sequence[tuple[Campaign, bool]], edges: bool
 ) -> Iterator[str]:
-    """Sentences on the extension as a whole, whatever the verdict."""
-    yield from _given_up(steps, selection, searched)
+    """Sentences on the extension as a whole, whatever the verdict; `edges`: samples on the other side of a step's."""
+    what = "given up, as they may be at edges of steps" if edges else "given up, not modelled"
+    yield from (f"{line}: {what}." for line in _given_up(steps, selection, searched))
     found = selection.found
     for one, other in zip(selection.path, selection.path[1:], strict=False):
         if one.paired and {one.name, other.name} <= {step.name for step in found}:
@@ -98,12 +99,12 @@ def _given_up(steps: Steps, selection: Selection, searched: Sequence[tuple[Campa
     dwells = steps.scanner.points_among(given_up)
     if dwells:
         what = f"{len(dwells)} whole dwells, which begin" if len(dwells) > 1 else "A whole dwell, which begins"
-        yield f"{what} {places([int(d[0]) for d in dwells], searched)}: given up, not modelled."
+        yield f"{what} {places([int(d[0]) for d in dwells], searched)}"
     of_dwells = {int(row) for dwell in dwells for row in dwell}
     errors = [row for row in given_up if row not in of_dwells]
     if errors:
         what = f"{len(errors)} gross errors" if len(errors) > 1 else "A gross error"
-        yield f"{what} {places(errors, searched)}: given up, not modelled."
+        yield f"{what} {places(errors, searched)}"
 
 
 def _in_campaign(effect: Effect | None) -> str:

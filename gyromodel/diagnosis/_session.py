@@ -14,6 +14,7 @@ from gyromodel.diagnosis._data import Data, read
 from gyromodel.diagnosis._evidence import safe_threshold
 from gyromodel.diagnosis._gain import ladder_error
 from gyromodel.diagnosis._misfit import unexplained_axes
+from gyromodel.diagnosis._readings import Readings
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import Progress, Selection, search, significant_driver, steadied
 from gyromodel.diagnosis._steps import EXCHANGE, NoisePath, Steps, standing
@@ -76,16 +77,50 @@ class Session:
         return selection
 
 
-def laid_out(record: Record, model: GyroModel, threshold: float | None = None, step: float = 0.0) -> Session:
-    """A search on a record, by the safe threshold if none is given; `step`: of the coarsest reading behind its output.
+def laid_out(
+    record: Record, model: GyroModel, threshold: float | None = None, step: float = 0.0, outliers: bool = True
+) -> Session:
+    """A search on a record.
+
+    Args:
+        record: the data.
+        model: the simulation.
+        threshold: the safe one if none is given.
+        step: of the coarsest reading behind its output.
+        outliers: whether gross errors are looked for.
 
     Raises:
         EstimateError: the simulation cannot be fitted.
     """
     baseline = fit_record(record, model)
-    scanner = Scanner(record, build_bank(record), _grid(record, baseline), stated=baseline.noise_given, step=step)
+    scanner = Scanner(
+        record, build_bank(record), _grid(record, baseline), outliers=outliers, stated=baseline.noise_given, step=step
+    )
     safe = safe_threshold(baseline.degrees_of_freedom)
     return Session(scanner, baseline, safe if threshold is None else threshold)
+
+
+def over_unrounded(
+    record: Record, estimate: Estimate, model: GyroModel, readings: Readings, threshold: float | None = None
+) -> Session | None:
+    """The search beside rounding as it is at a fit; None where rounding adds noise alone, or cannot be told.
+
+    Args:
+        record: as it was read.
+        estimate: the fit.
+        model: the simulation.
+        readings: how the output is read.
+        threshold: see `laid_out`.
+    """
+    found = readings.beside(record, estimate)
+    if not found.changed:
+        return None
+    try:
+        corrected = record.signals | {"output": found.record.signals["output"]}
+        # Where edges are sharp, what is read beyond one stands apart as gross errors do.
+        return laid_out(record._replace(signals=corrected), model, threshold, outliers=not found.saw_tooth)
+    except EstimateError:
+        return None
 
 
 def over_smooth_thermometers(
@@ -99,7 +134,7 @@ def over_smooth_thermometers(
     if _lost_to_thermometers(session, record, selection) < LOST:
         return None
     try:
-        smooth = laid_out(record, model, session.threshold)
+        smooth = laid_out(record, model, session.threshold, outliers=session.scanner.outliers)
     except EstimateError:
         return None
     other = smooth.run(say)

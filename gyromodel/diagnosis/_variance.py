@@ -12,7 +12,7 @@ from gyromodel._checks import thermometers
 from gyromodel.campaign import Campaign
 from gyromodel.declarations import RATE_OF
 from gyromodel.estimate import Estimate
-from gyromodel.noise_analysis import quantum
+from gyromodel.numerics.rounding import quantum
 from gyromodel.signals import Record
 
 SIGNIFICANT = 1e-5
@@ -132,7 +132,7 @@ def follow(estimate: Estimate, grows: Growth) -> str | None:
 def tails(estimate: Estimate) -> str | None:
     """A sentence where whitened residuals have far heavier tails than a normal distribution."""
     e = estimate.whitened[np.isfinite(estimate.whitened)]
-    if len(e) < 50:
+    if len(e) < 50 or not e.std():
         return None
     excess = stats.kurtosis(e)
     if excess / np.sqrt(24.0 / len(e)) < HEAVY:

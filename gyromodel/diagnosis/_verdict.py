@@ -20,13 +20,13 @@ from gyromodel.diagnosis._result import CREDIBLE, VAGUE, Cause, ParameterValue, 
 from gyromodel.diagnosis._said import places, told, told_of_cause, told_of_rest
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import Selection
-from gyromodel.diagnosis._shapes import remaining
+from gyromodel.diagnosis._shapes import driver_shape, remaining
 from gyromodel.diagnosis._steps import Found, Steps
-from gyromodel.diagnosis._variance import quantum
 from gyromodel.effects._shapes import beyond_earth
 from gyromodel.effects.drivers import BiasPeriodic
 from gyromodel.estimate import Estimate
 from gyromodel.model import effect_class
+from gyromodel.numerics.rounding import quantum
 from gyromodel.signals import Record
 from gyromodel.units import factor
 
@@ -107,14 +107,19 @@ def judge(
     trials: int,
     null_scores: np.ndarray,
     searched: Sequence[tuple[Campaign, bool]],
+    saw_tooth: float = 0.0,
 ) -> Judgement:
-    """The verdict on a finished search; `searched`: the record's campaigns, and whether they are as given."""
+    """The verdict on a finished search.
+
+    `searched`: the record's campaigns, and whether they are as given; `saw_tooth`: what rounding may have left in the
+    output, peak to peak in its unit.
+    """
     scanner, last = steps.scanner, selection.last
-    findings = list(told(steps, selection, extended, searched))
+    findings = list(told(steps, selection, extended, searched, saw_tooth > 0.0))
     causes, sets = [], []
     for i, step in enumerate(selection.found):
         ranking = _ranking_of(steps, selection, i)
-        members = _members(steps, selection, extended, step, ranking)
+        members = _members(steps, selection, extended, step, ranking, saw_tooth)
         if not members:
             continue
         beside = {f.name for f in selection.found if f is not step}
@@ -131,6 +136,12 @@ def judge(
     if selection.remains and not selection.unresolved:
         findings.append(told_of_rest(selection, extended))
     driver, share = remaining(scanner, steps.baseline, selection)
+    if driver and _curve_of_rounding(steps, selection, driver, saw_tooth):
+        findings.append(
+            f"What follows {' and '.join(smooth_columns(driver))} is no larger than what rounding makes: finer steps "
+            "of the output would tell."
+        )
+        driver = None
     unexplained = {" and ".join(smooth_columns(driver)): share} if driver else {}
 
     def judged(verdict: Verdict, causes: Sequence[Cause], credible: dict[str, float], **more: str | None) -> Judgement:
@@ -141,13 +152,13 @@ def judge(
     strongest = max((c.statistic for c in causes), default=0.0)
     if driver and (share > UNKNOWN_SHARE or last.statistic[driver] > UNKNOWN_EVIDENCE * strongest):
         return judged("unknown", causes, {driver: 1.0}, driver=driver, next_test=_test_of_driver(driver))
-    if _outweighed(causes, selection, scanner.record.domain):
+    if not saw_tooth and _outweighed(causes, selection, scanner.record.domain):
         # A name holds less of what is there than it leaves, in a form that it cannot have; or all of them do.
         driver, score = last.best(drivers=True)
         driver = driver if score > steps.threshold else None
         return judged("unknown", causes, {driver or str(selection.remains): 1.0}, driver=driver)
     # Single gross errors are no cause, however many of them a search did not come to.
-    if not causes and selection.remains and (scanner.by_points or selection.remains != "outliers"):
+    if not causes and selection.remains and not saw_tooth and (scanner.by_points or selection.remains != "outliers"):
         return judged("unknown", (), {selection.remains: 1.0})
     if not causes:
         return judged("adequate", (), {})
@@ -177,7 +188,9 @@ def _ranking_of(steps: Steps, selection: Selection, i: int) -> Ranking:
     return ranking if ranking is not None and step.name in ranking.statistic else step.ranking
 
 
-def _members(steps: Steps, selection: Selection, extended: Estimate, step: Found, ranking: Ranking) -> dict[str, float]:
+def _members(
+    steps: Steps, selection: Selection, extended: Estimate, step: Found, ranking: Ranking, saw_tooth: float
+) -> dict[str, float]:
     """The names that may stand for what was found, with their shares; none where it is no cause."""
     scanner, name = steps.scanner, step.name
     # What was not added may stand in the place of this.
@@ -194,7 +207,35 @@ def _members(steps: Steps, selection: Selection, extended: Estimate, step: Found
         members = own | {k: 0.5 / len(rivals) + own.get(k, 0.0) for k in rivals}
     if isinstance(step.effect, BiasPeriodic) and _of_rounding(extended):
         members = {k: 0.5 * share for k, share in members.items()} | {"noise_quantisation": 0.5}
+    if saw_tooth and step.points and _farthest(extended, step.points) < ROUNDED * saw_tooth:
+        return {}
+    if saw_tooth and step.effect is not None and _reach(extended, name) < ROUNDED * saw_tooth:
+        members = {k: 0.5 * share for k, share in members.items()} | {"quantisation": 0.5}
     return members
+
+
+def _curve_of_rounding(steps: Steps, selection: Selection, driver: str, saw_tooth: float) -> bool:
+    """Whether a curve may be what rounding has left."""
+    if not saw_tooth:
+        return False
+    curve = driver_shape(steps.scanner, selection, driver, steps.scanner.record.input_unit).y
+    return bool(abs(float(selection.estimate.model.gain())) * np.ptp(curve) < ROUNDED * saw_tooth)
+
+
+def _farthest(estimate: Estimate, rows: Sequence[int]) -> float:
+    """How far the farthest of some rows that were given up lies from the model."""
+    signals = estimate.record.signals
+    left = np.asarray(signals["output"] - estimate.model.predict(signals))
+    return float(np.abs(left[list(rows)]).max())
+
+
+def _reach(estimate: Estimate, name: str) -> float:
+    """The most that an effect does to the output."""
+    signals, model = estimate.record.signals, estimate.model
+    if name not in model.labels:
+        return np.inf
+    change = np.asarray(model.predict(signals) - model.without(name).predict(signals))
+    return float(np.abs(change[: estimate.record.rows][estimate.record.present]).max())
 
 
 def _with_doubts(
@@ -286,6 +327,16 @@ def structured(judgement: Judgement, ranking: Ranking, column: str) -> Judgement
     return replace(judgement, verdict="unknown", credible_set={name: 1.0}, driver=driver, next_test=test)
 
 
+def with_steps(judgement: Judgement, steps: Cause) -> Judgement:
+    """The judgement with steps of the output beside what else the simulation lacks."""
+    if judgement.verdict == "adequate":
+        return replace(judgement, verdict="named", causes=(steps,), credible_set={steps.effect: 1.0})
+    if judgement.verdict == "named":
+        return replace(judgement, causes=tuple(sorted((*judgement.causes, steps), key=lambda c: -c.statistic)))
+    others = tuple(c for c in judgement.causes if c.effect != steps.effect)
+    return replace(judgement, causes=(*others, steps))
+
+
 def with_noise(judgement: Judgement, beyond: Sequence[Cause], trials: int) -> Judgement:
     """The judgement with kinds of noise that the simulation lacks beside what else it lacks."""
     if not beyond:
@@ -347,6 +398,8 @@ def _next_test(names: list[str], record: Record, cause: Cause) -> str:
             f"Repeat the points at {levels} deg/s several times, in both directions and in random order: anomalous "
             "test points do not come back, a curve does."
         )
+    if "quantisation" in names:
+        return effect_class("quantisation").test
     if {"bias_periodic", "noise_quantisation"} <= set(names):
         return (
             "Run the rates at another speed, or read the output in finer steps: what rounding makes of a steady change "

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from gyromodel._checks import accelerations, thermometers
 
 Signals = Mapping[str, Float[Array, " sample"]]
-Site = Literal["gain", "scale", "rate", "output", "angle"]
+Site = Literal["gain", "scale", "rate", "output", "readout", "angle"]
 Domain = Literal["gyro", "platform"]
 # In `needs`: any thermometer besides `temperature`, and any column of specific force. Columns of which one is enough
 # are joined by " or ".
@@ -65,8 +65,9 @@ class Effect(eqx.Module):
     """One additive term of the gyro model.
 
     `site` says where it acts in output = gain · (u + output terms), u = (rate + Σ rate terms) · (1 + Σ scale terms): to
-    an output term, u is the signal "rate". `domain` says whose output it is: that of a gyro, or the angle of a
-    platform's base less that of its table, a sum of angle terms alone. Fields
+    an output term, u is the signal "rate"; a readout effect is how the output, noise and all, is read. `domain` says
+    whose output it is: that of a gyro, or the angle of a platform's base less that of its table, a sum of angle terms
+    alone. Fields
     declared with `parameter` are its parameters. `columns` returns one column per linear coefficient, in field order,
     and may depend on the nonlinear ones; the contribution is columns @ coefficients, so zero coefficients are exactly
     the model without it.

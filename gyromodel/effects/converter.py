@@ -1,4 +1,4 @@
-"""What converters add: the end of their range, and the errors of their codes."""
+"""What converters add: the end of their range, its steps, and the errors of their codes."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from gyromodel.effects._base import Effect, Signals, parameter, stack
 from gyromodel.effects._shapes import EARTHLY, beyond_earth
+from gyromodel.numerics.rounding import grid_step
 
 # Limits searched, as parts of the largest rate, and different rates that must lie beyond one.
 LOWEST, HIGHEST, LIMITS, FEWEST_BEYOND = 0.2, 0.99, 24, 2
@@ -63,6 +64,46 @@ class Saturation(Effect):
         levels = np.unique(np.round(np.abs(np.asarray(signals["rate"])), 9))
         limits = levels[-1] * np.linspace(LOWEST, HIGHEST, LIMITS)
         return [cls(limit=limit) for limit in limits if np.sum(levels > limit) >= FEWEST_BEYOND]
+
+
+class Quantisation(Effect):
+    """output = q · round(u/q), u the output with its noise: it is read in steps of q.
+
+    A model's prediction is what is told before it is read, so that the effect has no columns. A simulation reads it in
+    steps; a fit takes what rounding adds on the average from its data where the noise does not smear it, and counts the
+    rest as noise. Of increments and angles it is the angle that is read, whose rounding is noise_quantisation. `unit`
+    is that of the output; without a step it is that of the data.
+    """
+
+    id = "quantisation"
+    site = "readout"
+    needs = ()
+    cause = "The converter or the log holds the output in steps as large as its noise, or larger."
+    test = "Read the output in finer steps, or turn slowly through several: errors of rounding repeat with each step."
+    held = ("step",)
+
+    step: Float[Array, ""] = parameter("1", 1e-3, "in the unit of the output", linear=False, default=jnp.nan)
+    unit: str = eqx.field(static=True, default="")
+
+    def __check_init__(self) -> None:
+        if self.step <= 0:
+            raise ValueError("a step is above zero")
+
+    def prepared(self, signals: Signals) -> Self:
+        """The step of the grid that the output lies on."""
+        if np.isfinite(float(self.step)) or "output" not in signals:
+            return self
+        step = grid_step(np.asarray(signals["output"]))
+        return self if step is None else eqx.tree_at(lambda e: e.step, self, jnp.asarray(step, float))
+
+    def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
+        """None."""
+        return jnp.zeros((len(signals["time"]), 0))
+
+    @classmethod
+    def candidates(cls, signals: Signals) -> list[Self]:
+        """None: the output's grid shows it."""
+        return []
 
 
 class BiasReadoutCode(Effect):

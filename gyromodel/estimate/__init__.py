@@ -18,6 +18,7 @@ from gyromodel.estimate._fit import (
 from gyromodel.estimate._function import FunctionFit, fit_function
 from gyromodel.estimate._many import ManyFits, fit_many
 from gyromodel.estimate._noise import with_noise_intervals
+from gyromodel.estimate._rounding import as_read, step_of, unrounded, with_reading
 from gyromodel.estimate._two_stage import two_stage
 
 __all__ = [
@@ -26,6 +27,7 @@ __all__ = [
     "EstimateError",
     "FunctionFit",
     "ManyFits",
+    "as_read",
     "calibration_of",
     "check_covariates",
     "filter_of",
@@ -40,8 +42,11 @@ __all__ = [
     "read_for_fit",
     "refuse_apart",
     "refuse_missing",
+    "step_of",
     "two_stage",
+    "unrounded",
     "validity_unit",
     "whiten_columns",
     "with_noise_intervals",
+    "with_reading",
 ]

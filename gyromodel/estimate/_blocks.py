@@ -16,13 +16,10 @@ from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Bool, Float
 
 from gyromodel.effects import Effect, Signals
-from gyromodel.model import GyroModel
+from gyromodel.model import LATER, GyroModel
 from gyromodel.numerics.state_space import Filter, at_rest, whiten_on
 
 BLOCK = 512
-# Sites whose rows depend on what all other effects add up to.
-LATER = ("gain", "output")
-
 # Of one effect: a row for each linear coefficient, and one for each nonlinear parameter; None where there is none free.
 Rows = tuple[Float[Array, "*block coefficient sample"], Float[Array, "*block shape sample"] | None]
 

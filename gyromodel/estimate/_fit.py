@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Literal
 
 import jax
@@ -14,9 +15,11 @@ from gyromodel._checks import CampaignError
 from gyromodel.attitude import refuse_navigated, with_reference_rates
 from gyromodel.averages import MEAN_OF_ATTITUDE, average
 from gyromodel.campaign import Campaign
+from gyromodel.effects.converter import Quantisation
 from gyromodel.estimate._estimate import Estimate, EstimateError, noise_coefficients
 from gyromodel.estimate._noise import best_ratios, settled, with_noise_intervals
 from gyromodel.estimate._optimistix import optimistix_solution
+from gyromodel.estimate._rounding import as_read, step_of, unrounded, widened, with_reading
 from gyromodel.model import GyroModel, ModelError, check_domain, check_units
 from gyromodel.noise import NoiseRatios, from_grams, markov_sum, stated_ratios
 from gyromodel.numerics.least_squares import Normal, Solution, levenberg_marquardt
@@ -116,6 +119,9 @@ def fit_record(
     check_units(model, record.output_unit, record.units)
     model = model.prepared(record.signals)
     check_enough(record, len(model.slots()))
+    if model.reading is not None:
+        again = partial(fit_record, start=start, markov=markov, solver=solver, ordinary=ordinary)
+        return _fit_readings(record, model, model.reading, ratios, again)
     given = given_ratios(record, model) if ratios is None else ratios
     white = NoiseRatios(jnp.zeros(()), jnp.zeros(()))
     shapes = not all(slot.linear for slot in model.slots())
@@ -142,6 +148,26 @@ def fit_record(
         filter = filter_of(record, estimate.ratios)
         estimate = _finish(record, model, estimate.ratios, filter, solution, variance=estimate.white_variance)
     return estimate
+
+
+def _fit_readings(
+    record: Record, model: GyroModel, reading: Quantisation, ratios: NoiseRatios | None, fit: Callable[..., Estimate]
+) -> Estimate:
+    """As `fit_record`, of a model that reads its output in steps; `fit` fits one that does not."""
+    step = step_of(model, record)
+    bare = as_read(model, record, step)
+    estimate = fit(record, bare, ratios=ratios)
+
+    def refit(data: Record) -> Estimate:
+        return fit(data, estimate.model_as_given(), ratios=estimate.ratios)
+
+    if step:
+        found = unrounded(record, estimate, step, refit)
+        if found.changed:
+            estimate = fit(found.record, replace(found.estimate.model, noise=bare.noise), ratios=ratios)
+        if found.changed or found.stuck:
+            estimate = widened(record, estimate, step, found.stuck)
+    return with_reading(estimate, reading, model)
 
 
 def _in_turns(
@@ -294,7 +320,9 @@ def _finish(
     if ordinary:
         covariance = _ordinary_covariance(record, filter, jacobian, model)
     nu = len(w) - p
-    white = float(w[:, p] @ w[:, p]) / nu if variance is None else variance
+    # Of data without noise, what double precision leaves of their size.
+    least = (np.finfo(float).eps * float(np.nanmax(np.abs(np.asarray(output)), initial=0.0))) ** 2
+    white = max(float(w[:, p] @ w[:, p]) / nu, least) if variance is None else variance
     likelihood = from_grams(np.atleast_1d(filter.log_determinant), (w.T @ w)[None], len(w)).log_likelihood[0]
     noise = dict(model.noise) or noise_coefficients(ratios, white, record, float(model.gain()))
     rows = record.rows

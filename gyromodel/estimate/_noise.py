@@ -9,6 +9,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 
 from gyromodel.estimate._estimate import Estimate, EstimateError, noise_coefficients
+from gyromodel.estimate._rounding import white_before
 from gyromodel.model import GyroModel
 from gyromodel.noise import NoiseRatios, markov_cells, noise_grid, restricted_likelihood
 from gyromodel.signals import Record
@@ -137,7 +138,8 @@ def with_noise_intervals(estimate: Estimate) -> Estimate:
     spans = {k: (float(v.min()), float(v.max())) for k, v in noise_coefficients(ratios, white, record, gain).items()}
     low, high = spans["noise_white"]
     scatter = 1.96 / float(np.sqrt(2 * (record.present.sum() - 1)))
-    spans["noise_white"] = (low * (1 - scatter), high * (1 + scatter))
+    low, high = low * (1 - scatter), high * (1 + scatter)
+    spans["noise_white"] = white_before(estimate, low), white_before(estimate, high)
     if len(grid.flicker) == 1:
         # So few samples show no colour: there may be any amount of it.
         spans |= {name: (0.0, np.inf) for name in spans if name != "noise_white"}

@@ -21,7 +21,7 @@ from gyromodel.units import factor, from_internal, internal_unit
 
 FORMULA = (
     "output = (product of gain terms) * (rate + sum of rate terms) * (1 + sum of scale terms); "
-    "a term is the sum of its columns times their parameters"
+    "a term is the sum of its columns times their parameters; a readout term is how all that, with its noise, is read"
 )
 
 

@@ -163,6 +163,9 @@ def _with_size(cause: Cause, at: Held) -> str:
         sizes = [p for p in sizes if p.name in at]
         other = f"{_values(sizes)} instead of {_as_held(sizes, at)}" if sizes else "other values"
         return f"{definite(cause.effect)} at {other}"
+    if cause.effect == "quantisation" and cause.parameters:
+        step = cause.parameters[0]
+        return f"{phrase(cause.effect)} in steps of {stated(step.value, step.unit)}"
     if cause.effect == "scale_factor" and len(sizes) == 1:
         if sizes[0].unit != "1":
             return f"a scale factor of {_values(sizes)}"

@@ -30,6 +30,7 @@ PHRASES = {
     "bias_temperature_gradient": "a bias proportional to a temperature difference",
     "bias_temperature_gradient_rate": "a bias proportional to the rate of a temperature difference",
     "rate_hysteresis": "a hysteresis over rate",
+    "quantisation": "a quantisation of the output",
     "saturation": "saturation: the output ends at the limits of its range",
     "bias_readout_code": "an error of the feedback ramp's codes",
     "bias_turn_on": "a bias that differs from turn-on to turn-on",

@@ -1,0 +1,125 @@
+"""Outputs that are read in steps: what rounding adds to them on the average, and the steps as a cause."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+
+from gyromodel.campaign import Campaign
+from gyromodel.diagnosis._noise_causes import as_cause
+from gyromodel.diagnosis._result import Cause, ParameterValue
+from gyromodel.effects.converter import Quantisation
+from gyromodel.estimate import Estimate, as_read, fit_record, step_of, unrounded
+from gyromodel.estimate._rounding import Unrounded, widened
+from gyromodel.model import GyroModel
+from gyromodel.numerics.rounding import grid_step
+from gyromodel.signals import Record
+from gyromodel.units import factor, from_internal, internal_unit
+
+# Steps that differ by less than this part are one.
+SAME = 0.01
+# What each sample on a grid is worth (nats): as if it might have been written with one digit more.
+WORTH = float(np.log(10.0))
+
+
+@dataclass(frozen=True)
+class Readings:
+    """How a gyro's output is read.
+
+    Attributes:
+        step: of the grid that it lies on, internal unit; zero where it lies on none, or is no rate.
+        scatter: from sample to sample, where means are searched; zero where samples are.
+        unit: of the output in its file.
+    """
+
+    step: float = 0.0
+    scatter: float = 0.0
+    unit: str = ""
+
+    def beside(self, record: Record, estimate: Estimate) -> Unrounded:
+        """A fit's data less what rounding adds to them on the average, `record` being as it was read."""
+
+        def refit(data: Record) -> Estimate:
+            return fit_record(data, estimate.model_as_given(), ratios=estimate.ratios, solver="levenberg_marquardt")
+
+        if not self.step or self.scatter:
+            return Unrounded(record, estimate)
+        return unrounded(_as_read(record, estimate), estimate, self.step, refit)
+
+    def widened(self, record: Record, estimate: Estimate, found: Unrounded) -> Estimate:
+        """The fit with the covariance that steps leave it."""
+        if not (found.changed or found.stuck):
+            return estimate
+        return widened(_as_read(record, estimate), estimate, self.step, found.stuck)
+
+    def told(self, found: Unrounded) -> str:
+        """What was done about steps that are a cause, in a sentence."""
+        step = f"steps of {float(from_internal(self.step, self.unit)):.5g} {self.unit}"
+        if found.changed:
+            return (
+                f"The output is read in {step}: what rounding adds on the average was taken away for the search and "
+                "its errors, and the rest counts as white noise."
+            )
+        if found.stuck:
+            return (
+                f"The output is read in {step}, and moves over too few for the noise to tell more: what is smaller "
+                "than one may be rounding."
+            )
+        return f"The output is read in {step}: rounding counts as white noise."
+
+    def coarse_beside(self, estimate: Estimate) -> bool:
+        """Whether the steps are as large as what a fit leaves from sample to sample, or larger."""
+        return self.step > 0.0 and bool(self.step >= (self.scatter or np.sqrt(estimate.white_variance)))
+
+    def coarse(self, estimate: Estimate, found: Unrounded) -> bool:
+        """Whether the steps are a cause: as large as what else scatters, or such that rounding adds more than noise."""
+        return self.coarse_beside(estimate) or found.changed or found.stuck
+
+    def bare(self, model: GyroModel, record: Record) -> tuple[GyroModel, Quantisation | None]:
+        """A model of what is read, and how the model reads it: in the data's steps where it leaves them open."""
+        if model.reading is None:
+            return model, None
+        if self.step and not np.isfinite(float(model.reading.step)):
+            model = model.without(model.reading.label).with_effect(self.as_effect())
+        model = model.prepared(record.signals)
+        return as_read(model, record, step_of(model, record)), model.reading
+
+    def least(self, estimate: Estimate) -> float:
+        """The smallest step that would be told, in the unit of the file."""
+        return float(from_internal(self.scatter or np.sqrt(estimate.white_variance), self.unit))
+
+    def same_as(self, reading: Quantisation | None) -> bool:
+        """Whether a model's reading is this one."""
+        return reading is not None and bool(abs(float(reading.step) - self.step) < SAME * self.step)
+
+    def as_effect(self) -> Quantisation:
+        """These steps in a model."""
+        return Quantisation(step=jnp.asarray(self.step), unit=self.unit)
+
+    def as_cause(self, samples: int) -> Cause:
+        """These steps as what a simulation lacks, on so many samples."""
+        step = ParameterValue("step", float(from_internal(self.step, self.unit)), 0.0, self.unit)
+        return as_cause("quantisation", samples * WORTH, step)
+
+
+def _as_read(record: Record, estimate: Estimate) -> Record:
+    """The data of a fit with the output as it was read."""
+    return estimate.record._replace(signals=estimate.record.signals | {"output": record.signals["output"]})
+
+
+def readings_of(campaigns: Sequence[Campaign], searched: Sequence[Campaign]) -> Readings:
+    """How the output of one gyro's campaigns is read, of which these or means of them are searched."""
+    unit = campaigns[0].units["output"]
+    if any(c.metadata["kind"] != "rate" for c in campaigns):
+        return Readings()
+    steps = [
+        (grid_step(c.columns["output"]) or 0.0) * factor(c.units["output"], internal_unit(unit)) for c in campaigns
+    ]
+    if not min(steps) > (1.0 - SAME) * max(steps):
+        return Readings(unit=unit)
+    means = any(len(s) < len(c) for c, s in zip(campaigns, searched, strict=True))
+    scatter = max(float(np.nanstd(np.diff(c.si("output")))) for c in campaigns) / np.sqrt(2.0) if means else 0.0
+    return Readings(steps[0], scatter, unit)
