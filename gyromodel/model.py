@@ -332,7 +332,8 @@ def parameter_unit(effect: Effect, field: str, output_unit: str, units: Mapping[
     A gain's and a readout's follow the output, a linear driver's its column (file units).
     """
     if effect.site == "readout":
-        return "deg/s" if output_unit == "rad/s" else output_unit
+        own = getattr(effect, "unit", "")
+        return own if own not in ("", "1") else "deg/s" if output_unit == "rad/s" else output_unit
     if effect.site == "gain":
         if output_unit == "rad/s":
             return "1"
@@ -349,6 +350,13 @@ def check_domain(model: GyroModel, domain: Domain) -> None:
     if model.domain not in (domain, None):
         named = f"effect {model.effects[0].label}" if model.effects else "the noise of the model"
         raise ModelError(f"{named} is of {OF[model.domain]}, but the campaign is of {OF[domain]}")
+
+
+def check_reading(reading: Quantisation | None, unit: str) -> None:
+    """Refuse steps in a unit other than that of the output they are of."""
+    if reading is not None and reading.unit and not convertible(reading.unit, unit):
+        given = "a plain number" if reading.unit == "1" else f"in {reading.unit}"
+        raise ModelError(f"{reading.label} is {given}, but the output is in [{unit}]: expected {unit}")
 
 
 def check_units(model: GyroModel, output_unit: str, units: Mapping[str, str]) -> None:
@@ -371,7 +379,7 @@ def check_units(model: GyroModel, output_unit: str, units: Mapping[str, str]) ->
             continue
         name = next(iter(effect.declared()))
         what = f"the output is in [{output_unit}]"
-        accepted = [parameter_unit(effect, name, output_unit, units)]
+        accepted = [] if effect.site == "readout" else [parameter_unit(effect, name, output_unit, units)]
         if isinstance(effect, BiasColumn):
             what = f"column {effect.column} is in [{units.get(effect.column, '')}]"
         if effect.site == "gain":

@@ -9,11 +9,11 @@ import numpy as np
 from gyromodel._checks import CampaignError
 from gyromodel.campaign import Campaign
 from gyromodel.effects.converter import Quantisation
-from gyromodel.model import GyroModel, ModelError, check_units
+from gyromodel.model import GyroModel, ModelError, check_reading, check_units
 from gyromodel.noise import NoiseRatios, markov_sum, stated_ratios
 from gyromodel.numerics.state_space import build_filter, colour
 from gyromodel.signals import Record, read_signals
-from gyromodel.units import convertible, from_internal
+from gyromodel.units import from_internal
 
 
 def simulate(model: GyroModel, campaign: Campaign, seed: int = 0) -> Campaign:
@@ -36,7 +36,9 @@ def simulate(model: GyroModel, campaign: Campaign, seed: int = 0) -> Campaign:
         campaign = campaign.with_column("output", np.arange(len(campaign), dtype=float), campaign.units["output"])
     record = read_signals(campaign)
     reading = model.reading
-    unset = [e.label for e in model.effects if not np.isfinite(np.append(e.linear(), getattr(e, "step", 0.0))).all()]
+    unset = [e.label for e in model.effects if not np.isfinite(np.asarray(e.linear())).all()]
+    if reading is not None and not np.isfinite(float(reading.step)):
+        unset.append(reading.label)
     if unset:
         raise ModelError(f"effect {unset[0]} has no value; fit the model or write one to simulate")
     check_units(model, record.output_unit, record.units)
@@ -57,8 +59,7 @@ def simulate(model: GyroModel, campaign: Campaign, seed: int = 0) -> Campaign:
 
 def _read(output: np.ndarray, reading: Quantisation, unit: str, kind: str) -> np.ndarray:
     """The output in whole steps; of increments what is left of one is counted in the next."""
-    if not convertible(reading.unit or unit, unit):
-        raise ModelError(f"{reading.label} is in [{reading.unit}], but the output is in [{unit}]")
+    check_reading(reading, unit)
     step = float(from_internal(np.asarray(reading.step), unit))
     whole = np.round((np.cumsum(output) if kind == "increment" else output) / step) * step
     return np.diff(whole, prepend=0.0) if kind == "increment" else whole

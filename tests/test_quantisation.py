@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.stats import binom
 
 import gyromodel as gm
 from gyromodel.diagnosis import Diagnosis
+from gyromodel.diagnosis._readings import _of_samples
 from gyromodel.effects.converter import Quantisation
 from gyromodel.estimate import Calibration
 from gyromodel.model import ModelError
@@ -78,7 +80,7 @@ def test_a_simulated_output_is_read_in_steps(tmp_path: Path):
     parts = simulate(of_angle, rest(np.arange(400.0), "deg", "increment"), seed=3).columns["output"]
     assert whole / 0.01 == pytest.approx(np.round(whole / 0.01), abs=1e-9)
     assert np.cumsum(parts) == pytest.approx(whole, abs=1e-9)
-    with pytest.raises(ModelError, match=r"quantisation is in \[arcsec\]"):
+    with pytest.raises(ModelError, match=r"quantisation is in arcsec, but the output is in \[deg/s\]"):
         simulate(of_angle, rest(np.arange(40.0)))
 
 
@@ -247,3 +249,94 @@ def test_two_levels_do_not_end_a_search():
     found = gm.diagnose(campaign, gm.model_from_effects(["bias"]), hold_out=False)
     assert "quantisation" in {c.effect for c in found.causes}
     assert found.verdict in ("named", "ambiguous")
+
+
+def test_lines_of_a_rounded_angle_are_not_a_periodic_bias():
+    """2.6 counts a sample: the rates alternate between two values at a pace of their own."""
+    rng = np.random.default_rng(3)
+    angle = np.cumsum(0.013 + 0.0005 * rng.standard_normal(1200))
+    found = gm.diagnose(
+        rest(np.diff(rounded(angle, 0.005), prepend=0.0)), gm.model_from_effects(["bias"]), hold_out=False
+    )
+    assert found.verdict == "adequate" or "noise_quantisation" in found.credible_set
+
+
+@pytest.mark.parametrize("rates", [11, 41])
+@pytest.mark.parametrize("digits", [4, 15])
+def test_a_sweep_of_even_rates_is_no_grid(rates: int, digits: int, rng: np.random.Generator):
+    """Outputs as evenly spaced as the rates, but for noise down to the last digit."""
+    for noise in (1e-4, 1e-3, 1e-2):
+        output = 1.0003 * np.linspace(-100.0, 100.0, rates) + 0.01 + noise * rng.standard_normal(rates)
+        step = grid_step(np.round(output, digits))
+        assert step is None or step < 1.5e-4
+
+
+@pytest.mark.parametrize("slow", ["lag", "walk"])
+def test_the_last_digit_of_slow_noise_is_no_step(slow: str, rng: np.random.Generator):
+    """Noise of a narrow band has next to no white part, and still scatters from sample to sample."""
+    drawn = rng.standard_normal(2000)
+    noise = 0.003 * np.cumsum(drawn) if slow == "walk" else 0.0044 * lfilter([1.0], [1.0, -0.9], drawn)
+    found = gm.diagnose(rest(np.round(noise, 3)), gm.model_from_effects(["bias"]), hold_out=False)
+    assert "quantisation" not in {c.effect for c in found.causes}
+
+
+def test_gross_errors_beside_sharp_edges_stay_left_out():
+    campaign, _ = levels(10.0 * NOISE, np.random.default_rng(3))
+    output = campaign.columns["output"].copy()
+    output[[123, 301]] += [1.0, -1.0]
+    model = gm.model_from_effects(["scale_factor", "bias"])
+    found = gm.diagnose(campaign.with_column("output", output, "deg/s"), model, hold_out=False)
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["quantisation"])
+    said = [line.split()[0] for line in found.findings if "samples that stand apart" in line]
+    assert len(said) == 1
+    assert 2 <= int(said[0]) <= 8
+
+
+def test_means_of_coarse_samples_have_their_noise_before_rounding():
+    """A log that is averaged for the search: the steps are those of its samples, and so is what they add."""
+    rng = np.random.default_rng(6)
+    log = rest(rounded(0.01 + 0.01 * rng.standard_normal(60_000), 0.02))
+    found = gm.diagnose(log, gm.model_from_effects(["bias"]), hold_out=False)
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["quantisation"])
+    row = found.noise["noise_white"]
+    assert float(row["value"]) == pytest.approx(0.01 * 60.0, rel=0.03)
+    moving = log.columns | {"rate": 30.0 * np.sin(np.arange(60_000.0) / 3.0)}
+    moving["output"] = rounded(moving["rate"] + 0.01 * rng.standard_normal(60_000), 0.05)
+    scatter = _of_samples(gm.Campaign(moving, {**log.units, "rate": "deg/s"}, {"kind": "rate"}))
+    assert np.rad2deg(scatter) == pytest.approx(np.hypot(0.01, 0.05 / np.sqrt(12.0)), rel=0.1)
+
+
+@pytest.mark.parametrize("kind", ["increment", "angle"])
+def test_a_model_of_a_rounded_angle_is_kept_and_simulated(kind: str, tmp_path: Path):
+    rng = np.random.default_rng(7)
+    output = rounded(np.cumsum(0.003 + NOISE * rng.standard_normal(300)), 0.01)
+    campaign = rest(output if kind == "angle" else np.diff(output, prepend=0.0), "deg", kind)
+    model = gm.model_from_effects(["bias", "quantisation"])
+    estimate = gm.fit(campaign, model)
+    write_model(estimate, tmp_path / "fitted.yaml")
+    again = simulate(read_model(tmp_path / "fitted.yaml"), campaign, seed=1).columns["output"]
+    assert again / 0.01 == pytest.approx(np.round(again / 0.01), abs=1e-6)
+    found = gm.diagnose(campaign, gm.model_from_effects(["bias"]), hold_out=False)
+    assert "quantisation" in found.not_testable
+    assert "quantisation" not in found.searched
+
+
+def test_campaigns_of_different_steps_are_said_not_to_be_searched():
+    rng = np.random.default_rng(8)
+    two = [rest(rounded(0.01 + NOISE * rng.standard_normal(200), step)) for step in (0.01, 0.005)]
+    found = gm.diagnose(two, gm.model_from_effects(["bias"]), hold_out=False)
+    assert "different steps" in found.not_testable["quantisation"]
+
+
+def test_known_steps_leave_no_doubt_of_their_own(tmp_path: Path):
+    """A fit without free parameters, and a search that takes no leftover of rounding for what the model has."""
+    rate = np.linspace(-3.0, 3.0, 400) + 0.013
+    output = rounded(rate + 5e-4 * np.random.default_rng(9).standard_normal(400), 0.01)
+    columns = {"time": np.arange(400.0), "rate": np.round(rate, 4), "output": np.round(output, 4)}
+    campaign = gm.Campaign(columns, {"time": "s", "rate": "deg/s", "output": "deg/s"}, {"kind": "rate"})
+    text = "effects:\n  - {effect: scale_factor, value: 1, fixed: true}\n  - {effect: quantisation, step: 0.01 deg/s}\n"
+    (tmp_path / "fixed.yaml").write_text(text, encoding="utf-8")
+    model = read_model(tmp_path / "fixed.yaml")
+    assert gm.fit(campaign, model).covariance.size == 0
+    found = gm.diagnose(campaign, model, hold_out=False)
+    assert "quantisation" not in found.credible_set

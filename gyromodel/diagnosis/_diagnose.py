@@ -112,11 +112,12 @@ def diagnose(
     findings += left_out
     say("fitting the simulation", 0.02)
     readings, given = data.readings, model
-    model, reading = readings.bare(given, record)
+    model, reading = readings.bare(given, measured, record)
     session = laid_out(record, model, step=data.step)
-    if readings.coarse_beside(session.baseline) and _quantised_angle(session.baseline, session.threshold):
+    if readings.coarse_beside(record, session.baseline) and _quantised_angle(session.baseline, session.threshold):
         readings = replace(readings, step=0.0)
-    session = over_unrounded(record, session.baseline, model, readings) or session
+    rounding = readings.beside(record, session.baseline)
+    session = over_unrounded(record, rounding, model) or session
     nulls = np.zeros(0)
     if calibrate:
         nulls = null_scores(session.scanner, session.baseline, calibrate, seed, say)
@@ -124,19 +125,22 @@ def diagnose(
     selection = session.run(say)
     for _ in range(ROUNDINGS if selection.found else 0):
         # Rounding is another beside what was found.
-        again = over_unrounded(record, selection.estimate, model, readings, session.threshold)
+        rounding = readings.beside(record, selection.estimate)
+        again = over_unrounded(record, rounding, model, session.threshold)
         if again is None:
             break
         names, session, selection = [f.name for f in selection.found], again, again.run(say)
         if [f.name for f in selection.found] == names:
             break
+    if rounding.changed and (left_out := int(np.sum(record.present & ~session.record.present))):
+        findings.append(f"{left_out} samples that stand apart from all others were left out beside rounding.")
     if record.domain == "gyro" and (others := over_smooth_thermometers(session, selection, model, say)):
         session, selection = others
         findings.append(SMOOTHED)
     beyond: list[Cause] = []
-    # What rounding leaves is larger at edges of steps.
-    even = readings.beside(record, selection.estimate).saw_tooth == 0.0
-    grows, following = growing_noise(session.record, selection.estimate) if even else None, None
+    # What rounding leaves is larger at edges of steps, where there is much more to tell than tails.
+    plain = record.domain == "gyro" and not rounding.saw_tooth
+    grows, following = None if rounding.saw_tooth else growing_noise(session.record, selection.estimate), None
     others = over_weighted(session, grows.white, model, say) if grows else None
     grows = grows if others else None
     if grows and others:
@@ -176,8 +180,6 @@ def diagnose(
         selection = session.pruned(selection)
     findings += [selection.unresolved] if selection.unresolved else []
     last = selection.estimate
-    rounding = readings.beside(as_it_was, last)
-    # Of edges of steps there is much more than that to tell.
     left = () if rounding.saw_tooth else (tails(last), dwells_apart(last, unit))
     findings += [line for line in (*left, noise_level(last)) if line]
     stated, slope = float(model.gain()), float(last.model.gain())
@@ -198,12 +200,12 @@ def diagnose(
             "Parameters weigh all samples alike: that predicts left-out blocks better than the fitted noise's weights "
             "do."
         )
-    judgement = judge(session.steps, selection, extended, len(names), nulls, data.rows_of, rounding.saw_tooth)
+    read_so = readings.same_as(reading)
+    judgement = judge(session.steps, selection, extended, len(names), nulls, data.rows_of, rounding.saw_tooth, read_so)
     # What follows itself at one end of a column has structure, whatever faint name takes a part of it.
     if following and grows and all(c.statistic < FAINT for c in judgement.causes):
         judgement = structured(judgement, selection.last, grows.column)
     stepped = None
-    plain = record.domain == "gyro" and not rounding.saw_tooth
     if plain and not selection.unfinished and (free := _with_noise_estimated(selection.estimate)):
         stepped = quantisation(free, session.threshold)
     if stepped is not None:
@@ -221,17 +223,19 @@ def diagnose(
         beyond if baseline.noise_given else [c for c in beyond if c is hops],
         len(names),
     )
-    coarse = readings.coarse(extended, rounding)
+    coarse = rounding.changed or rounding.stuck or readings.coarse_beside(as_it_was, extended)
     if coarse:
-        if not readings.same_as(reading):
+        if not read_so:
             judgement = with_steps(judgement, readings.as_cause(int(record.present.sum())))
         findings.append(readings.told(rounding))
     else:
         findings += data.stepped
     if coarse or reading:
-        extended = with_reading(extended, readings.as_effect() if coarse or reading is None else reading, given)
+        steps = readings.as_effect() if coarse else reading
+        assert steps is not None
+        extended = with_reading(extended, steps, given, as_it_was)
     if reading:
-        baseline = with_reading(baseline, reading, given)
+        baseline = with_reading(baseline, reading, given, as_it_was)
     next_test = judgement.next_test
     if judgement.verdict == "ambiguous":
         alike = list(judgement.credible_set)
@@ -242,10 +246,14 @@ def diagnose(
     rankings = [*(f.ranking for f in selection.path), selection.last]
     before, after = (np.asarray(e.model.predict(record.signals))[: record.rows] for e in (baseline, extended))
     slopes = [np.asarray(e.model.slope(record.signals))[: record.rows] for e in (baseline, extended)]
-    output = np.where(record.present, np.asarray(record.signals["output"])[: record.rows], np.nan)
+    # What rounding adds is part of what is predicted.
+    output, left = (np.asarray(r.signals["output"])[: record.rows] for r in (as_it_was, record))
+    before, after = before + output - left, after + output - left
+    output = np.where(record.present, output, np.nan)
     sizes = minimum_detectable(session.scanner, selection.last, session.threshold, unit)
-    if readings.unit and not coarse:
-        sizes["quantisation"] = readings.least(extended), readings.unit
+    steps_searched = record.domain == "gyro" and not readings.untested
+    if steps_searched and not coarse:
+        sizes["quantisation"] = readings.least(as_it_was, extended), readings.unit
     found = Diagnosis(
         verdict=judgement.verdict,
         causes=judgement.causes,
@@ -253,7 +261,8 @@ def diagnose(
         gain=gain,
         next_test=next_test,
         minimum_detectable=sizes,
-        not_testable=not_testable(session.scanner, selection.last, selection.estimate.model, sizes),
+        not_testable=not_testable(session.scanner, selection.last, selection.estimate.model, sizes)
+        | ({"quantisation": readings.untested} if readings.untested else {}),
         noise=extended.noise_table(),
         noise_kinds={} if baseline.noise_given else noise_kinds(session.scanner, selection.last),
         evidence=_evidence(selection, judgement.credible_set),
@@ -266,7 +275,7 @@ def diagnose(
         p_value=_p_value(selection, nulls) if calibrate else None,
         searched=tuple(
             dict.fromkeys(
-                [*names, *(name for r in rankings for name in r.tangents), *["quantisation"] * bool(readings.unit)]
+                [*names, *(name for r in rankings for name in r.tangents), *["quantisation"] * steps_searched]
             )
         ),
         campaign=data.whole,

@@ -19,7 +19,7 @@ from gyromodel.diagnosis._ranking import skipped
 from gyromodel.diagnosis._scan import epochs_of
 from gyromodel.effects import CATALOGUE, Effect, Signals
 from gyromodel.effects._base import evaluate
-from gyromodel.estimate import Estimate, filter_of, given_ratios, whiten_columns
+from gyromodel.estimate import Estimate, as_read, filter_of, given_ratios, step_of, whiten_columns
 from gyromodel.model import GyroModel, ModelError, effect_class, make_effect, parameter_unit
 from gyromodel.noise import NoiseRatios
 from gyromodel.signals import Record, read_signals, with_columns_known
@@ -266,6 +266,7 @@ def _sizes(
     """Sizes that are found, sizes that are told apart, and what is not testable."""
     record = with_columns_known(read_signals(campaigns))[0]
     model = model.prepared(record.signals)
+    model = as_read(model, record, step_of(model, record))
     ratios = given_ratios(record, model)
     assert ratios is not None
     std = float(model.noise["noise_white"]) / np.sqrt(record.interval) * abs(float(model.gain()))

@@ -62,6 +62,8 @@ def quantisation(estimate: Estimate, threshold: float) -> Cause | None:
     stretches = [e for e in stretches if len(e) >= STRETCH]
     if not stretches:
         return None
+    if not any(e.any() for e in stretches):
+        return None
     power = np.concatenate([np.square(np.asarray(dst(e, type=1, norm="ortho"))) for e in stretches])
     spectrum = np.concatenate([2.0 - 2.0 * np.cos(np.pi * np.arange(1, len(e) + 1) / (len(e) + 1)) for e in stretches])
     white, likelihood = _spectral_fit(power, 1.0 + np.append(0.0, SHARES)[:, None] * spectrum)

@@ -12,8 +12,16 @@ from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._noise_causes import as_cause
 from gyromodel.diagnosis._result import Cause, ParameterValue
 from gyromodel.effects.converter import Quantisation
-from gyromodel.estimate import Estimate, as_read, fit_record, step_of, unrounded
-from gyromodel.estimate._rounding import Unrounded, widened
+from gyromodel.estimate import (
+    Estimate,
+    Unrounded,
+    as_read,
+    fit_record,
+    step_of,
+    unrounded,
+    widened,
+    with_step_of,
+)
 from gyromodel.model import GyroModel
 from gyromodel.numerics.rounding import grid_step
 from gyromodel.signals import Record
@@ -23,6 +31,8 @@ from gyromodel.units import factor, from_internal, internal_unit
 SAME = 0.01
 # What each sample on a grid is worth (nats): as if it might have been written with one digit more.
 WORTH = float(np.log(10.0))
+# Differences of samples of this order hold noise and no motion; the sum of squares of their coefficients.
+ORDER, SQUARES = 3, 20.0
 
 
 @dataclass(frozen=True)
@@ -30,14 +40,16 @@ class Readings:
     """How a gyro's output is read.
 
     Attributes:
-        step: of the grid that it lies on, internal unit; zero where it lies on none, or is no rate.
+        step: of the grid that it lies on, internal unit; zero where it lies on none, or its steps are not searched.
         scatter: from sample to sample, where means are searched; zero where samples are.
         unit: of the output in its file.
+        untested: why steps are not searched; empty where they are.
     """
 
     step: float = 0.0
     scatter: float = 0.0
     unit: str = ""
+    untested: str = ""
 
     def beside(self, record: Record, estimate: Estimate) -> Unrounded:
         """A fit's data less what rounding adds to them on the average, `record` being as it was read."""
@@ -70,26 +82,32 @@ class Readings:
             )
         return f"The output is read in {step}: rounding counts as white noise."
 
-    def coarse_beside(self, estimate: Estimate) -> bool:
+    def coarse_beside(self, record: Record, estimate: Estimate) -> bool:
         """Whether the steps are as large as what a fit leaves from sample to sample, or larger."""
-        return self.step > 0.0 and bool(self.step >= (self.scatter or np.sqrt(estimate.white_variance)))
+        return self.step > 0.0 and bool(self.step >= self._scatter(record, estimate))
 
-    def coarse(self, estimate: Estimate, found: Unrounded) -> bool:
-        """Whether the steps are a cause: as large as what else scatters, or such that rounding adds more than noise."""
-        return self.coarse_beside(estimate) or found.changed or found.stuck
+    def _scatter(self, record: Record, estimate: Estimate) -> float:
+        """From sample to sample, of the output as it was read beside a fit: slow noise is none of it."""
+        if self.scatter:
+            return self.scatter
+        data = _as_read(record, estimate)
+        left = np.asarray(data.signals["output"] - estimate.model.predict(data.signals))[: data.rows]
+        together = data.present[1:] & data.present[:-1] & (np.diff(data.run[: data.rows]) == 0)
+        apart = np.diff(left)[together]
+        return float(np.sqrt(np.mean(apart**2) / 2.0)) if len(apart) else float(np.sqrt(estimate.white_variance))
 
-    def bare(self, model: GyroModel, record: Record) -> tuple[GyroModel, Quantisation | None]:
+    def bare(
+        self, model: GyroModel, campaigns: Sequence[Campaign], record: Record
+    ) -> tuple[GyroModel, Quantisation | None]:
         """A model of what is read, and how the model reads it: in the data's steps where it leaves them open."""
         if model.reading is None:
             return model, None
-        if self.step and not np.isfinite(float(model.reading.step)):
-            model = model.without(model.reading.label).with_effect(self.as_effect())
-        model = model.prepared(record.signals)
+        model = with_step_of(model, campaigns).prepared(record.signals)
         return as_read(model, record, step_of(model, record)), model.reading
 
-    def least(self, estimate: Estimate) -> float:
+    def least(self, record: Record, estimate: Estimate) -> float:
         """The smallest step that would be told, in the unit of the file."""
-        return float(from_internal(self.scatter or np.sqrt(estimate.white_variance), self.unit))
+        return float(from_internal(self._scatter(record, estimate), self.unit))
 
     def same_as(self, reading: Quantisation | None) -> bool:
         """Whether a model's reading is this one."""
@@ -114,12 +132,21 @@ def readings_of(campaigns: Sequence[Campaign], searched: Sequence[Campaign]) -> 
     """How the output of one gyro's campaigns is read, of which these or means of them are searched."""
     unit = campaigns[0].units["output"]
     if any(c.metadata["kind"] != "rate" for c in campaigns):
-        return Readings()
-    steps = [
-        (grid_step(c.columns["output"]) or 0.0) * factor(c.units["output"], internal_unit(unit)) for c in campaigns
-    ]
-    if not min(steps) > (1.0 - SAME) * max(steps):
-        return Readings(unit=unit)
+        return Readings(untested="the output is no rate: an angle that is rounded is noise_quantisation")
+    scales = [factor(c.units["output"], internal_unit(unit)) for c in campaigns]
+    steps = [(grid_step(c.columns["output"]) or 0.0) * scale for c, scale in zip(campaigns, scales, strict=True)]
     means = any(len(s) < len(c) for c, s in zip(campaigns, searched, strict=True))
-    scatter = max(float(np.nanstd(np.diff(c.si("output")))) for c in campaigns) / np.sqrt(2.0) if means else 0.0
-    return Readings(steps[0], scatter, unit)
+    scatter = max(map(_of_samples, campaigns)) if means else 0.0
+    if min(steps) > (1.0 - SAME) * max(steps) > 0.0:
+        return Readings(steps[0], scatter, unit)
+    return Readings(0.0, scatter, unit, "campaigns are read in different steps" if max(steps) > 0.0 else "")
+
+
+def _of_samples(campaign: Campaign) -> float:
+    """Scatter of an output from sample to sample, less motion: of what its high differences leave beside the rate's."""
+    output = np.diff(campaign.si("output"), ORDER)
+    rate = np.diff(campaign.si("rate"), ORDER) if "rate" in campaign.columns else np.zeros_like(output)
+    known = np.isfinite(output) & np.isfinite(rate)
+    output, rate = output[known], rate[known]
+    slope = float(rate @ output) / max(float(rate @ rate), np.finfo(float).tiny)
+    return float(np.sqrt(np.mean((output - slope * rate) ** 2) / SQUARES)) if known.any() else np.inf

@@ -14,12 +14,11 @@ from gyromodel.diagnosis._data import Data, read
 from gyromodel.diagnosis._evidence import safe_threshold
 from gyromodel.diagnosis._gain import ladder_error
 from gyromodel.diagnosis._misfit import unexplained_axes
-from gyromodel.diagnosis._readings import Readings
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import Progress, Selection, search, significant_driver, steadied
 from gyromodel.diagnosis._steps import EXCHANGE, NoisePath, Steps, standing
 from gyromodel.diagnosis._variance import with_variance
-from gyromodel.estimate import Estimate, EstimateError, fit_record
+from gyromodel.estimate import Estimate, EstimateError, Unrounded, fit_record
 from gyromodel.model import GyroModel
 from gyromodel.noise import NoiseGrid, NoiseRatios, noise_grid
 from gyromodel.signals import Record, with_columns_known, with_smooth_thermometers
@@ -101,24 +100,27 @@ def laid_out(
 
 
 def over_unrounded(
-    record: Record, estimate: Estimate, model: GyroModel, readings: Readings, threshold: float | None = None
+    record: Record, found: Unrounded, model: GyroModel, threshold: float | None = None
 ) -> Session | None:
-    """The search beside rounding as it is at a fit; None where rounding adds noise alone, or cannot be told.
+    """The search beside rounding as it was found at a fit; None where rounding adds noise alone, or cannot be told.
+
+    Samples that were given up stay so: where edges are sharp gross errors are not looked for, as what is read beyond an
+    edge stands apart too.
 
     Args:
         record: as it was read.
-        estimate: the fit.
+        found: the fit's data, less what rounding adds.
         model: the simulation.
-        readings: how the output is read.
         threshold: see `laid_out`.
     """
-    found = readings.beside(record, estimate)
     if not found.changed:
         return None
     try:
         corrected = record.signals | {"output": found.record.signals["output"]}
-        # Where edges are sharp, what is read beyond one stands apart as gross errors do.
-        return laid_out(record._replace(signals=corrected), model, threshold, outliers=not found.saw_tooth)
+        record = record._replace(signals=corrected)
+        if found.saw_tooth:
+            record = record.without(np.flatnonzero(record.present & ~found.record.present))
+        return laid_out(record, model, threshold, outliers=not found.saw_tooth)
     except EstimateError:
         return None
 
@@ -184,7 +186,8 @@ def over_weighted(
         baseline = fit_record(record, model)
     except EstimateError:
         return None
-    weighted = Scanner(record, scanner.bank, scanner.grid, stated=baseline.noise_given, step=scanner.step)
+    kept = {"outliers": scanner.outliers, "stated": baseline.noise_given, "step": scanner.step}
+    weighted = Scanner(record, scanner.bank, scanner.grid, **kept)
     again = Session(weighted, baseline, session.threshold)
     selection = again.run(say)
     return None if selection.unfinished else (again, selection)

@@ -32,7 +32,7 @@ from gyromodel.units import factor
 
 # Where the noise is slow even with them, these have no edge that a random walk could not make, whatever their lead.
 NO_EDGE = ("bias_drift", "bias_warmup")
-# Times the saw tooth of rounding that a line of its making may be, and steps over which the output has to move for it.
+# Times the saw tooth of rounding that what it makes may be.
 ROUNDED = 2.0
 # Nats below which a cause is faint, and times that by which a stronger one of the same thermometer outdoes it.
 FAINT, OUTDONE = 10.0, 10.0
@@ -108,11 +108,12 @@ def judge(
     null_scores: np.ndarray,
     searched: Sequence[tuple[Campaign, bool]],
     saw_tooth: float = 0.0,
+    stated: bool = False,
 ) -> Judgement:
     """The verdict on a finished search.
 
     `searched`: the record's campaigns, and whether they are as given; `saw_tooth`: what rounding may have left in the
-    output, peak to peak in its unit.
+    output, peak to peak in its unit; `stated`: whether the simulation reads the output in the same steps.
     """
     scanner, last = steps.scanner, selection.last
     findings = list(told(steps, selection, extended, searched, saw_tooth > 0.0))
@@ -120,6 +121,9 @@ def judge(
     for i, step in enumerate(selection.found):
         ranking = _ranking_of(steps, selection, i)
         members = _members(steps, selection, extended, step, ranking, saw_tooth)
+        if stated and "quantisation" in members:
+            findings.append(f"{step.name} is no larger than what rounding makes: finer steps of the output would tell.")
+            continue
         if not members:
             continue
         beside = {f.name for f in selection.found if f is not step}
@@ -295,15 +299,16 @@ def _left_by(cause: Cause, causes: Sequence[Cause], estimate: Estimate, vague: b
 
 
 def _of_rounding(estimate: Estimate) -> bool:
-    """Whether rounding alone makes lines as large as the strongest: of an output that moves over its steps."""
+    """Whether rounding alone makes lines as large as the strongest, of rates or of the angle behind them."""
     record, gain = estimate.record, abs(float(estimate.model.gain()))
     lines = [e for e in estimate.model.effects if isinstance(e, BiasPeriodic)]
     output = np.asarray(record.signals["output"])[: record.rows][record.present]
     step = quantum(output)
-    if step is None or not lines or np.ptp(output) < ROUNDED * step:
+    if step is None or not lines:
         return False
-    # The fundamental of the saw tooth, less by what noise of the unrounded output smears of it.
-    noise = max(estimate.white_variance - step**2 / 12.0, 0.0)
+    # The fundamental of the saw tooth, less by what noise of the unrounded output smears of it; at least of an angle's,
+    # whose differences have twice the variance of its rounding.
+    noise = max(estimate.white_variance - step**2 / 6.0, 0.0)
     tooth = step / np.pi * np.exp(-2.0 * np.pi**2 * noise / step**2)
     strongest = max(float(np.hypot(e.cosine, e.sine).max()) for e in lines)
     return bool(gain * strongest < ROUNDED * tooth)

@@ -12,7 +12,6 @@ from jaxtyping import Array, Float
 
 from gyromodel.effects._base import Effect, Signals, parameter, stack
 from gyromodel.effects._shapes import EARTHLY, beyond_earth
-from gyromodel.numerics.rounding import grid_step
 
 # Limits searched, as parts of the largest rate, and different rates that must lie beyond one.
 LOWEST, HIGHEST, LIMITS, FEWEST_BEYOND = 0.2, 0.99, 24, 2
@@ -72,7 +71,7 @@ class Quantisation(Effect):
     A model's prediction is what is told before it is read, so that the effect has no columns. A simulation reads it in
     steps; a fit takes what rounding adds on the average from its data where the noise does not smear it, and counts the
     rest as noise. Of increments and angles it is the angle that is read, whose rounding is noise_quantisation. `unit`
-    is that of the output; without a step it is that of the data.
+    is that of the output; without a step it is that of the campaign.
     """
 
     id = "quantisation"
@@ -88,13 +87,6 @@ class Quantisation(Effect):
     def __check_init__(self) -> None:
         if self.step <= 0:
             raise ValueError("a step is above zero")
-
-    def prepared(self, signals: Signals) -> Self:
-        """The step of the grid that the output lies on."""
-        if np.isfinite(float(self.step)) or "output" not in signals:
-            return self
-        step = grid_step(np.asarray(signals["output"]))
-        return self if step is None else eqx.tree_at(lambda e: e.step, self, jnp.asarray(step, float))
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """None."""

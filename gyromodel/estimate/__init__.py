@@ -18,7 +18,7 @@ from gyromodel.estimate._fit import (
 from gyromodel.estimate._function import FunctionFit, fit_function
 from gyromodel.estimate._many import ManyFits, fit_many
 from gyromodel.estimate._noise import with_noise_intervals
-from gyromodel.estimate._rounding import as_read, step_of, unrounded, with_reading
+from gyromodel.estimate._rounding import Unrounded, as_read, step_of, unrounded, widened, with_reading, with_step_of
 from gyromodel.estimate._two_stage import two_stage
 
 __all__ = [
@@ -27,6 +27,7 @@ __all__ = [
     "EstimateError",
     "FunctionFit",
     "ManyFits",
+    "Unrounded",
     "as_read",
     "calibration_of",
     "check_covariates",
@@ -47,6 +48,8 @@ __all__ = [
     "unrounded",
     "validity_unit",
     "whiten_columns",
+    "widened",
     "with_noise_intervals",
     "with_reading",
+    "with_step_of",
 ]

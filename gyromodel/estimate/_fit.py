@@ -19,7 +19,7 @@ from gyromodel.effects.converter import Quantisation
 from gyromodel.estimate._estimate import Estimate, EstimateError, noise_coefficients
 from gyromodel.estimate._noise import best_ratios, settled, with_noise_intervals
 from gyromodel.estimate._optimistix import optimistix_solution
-from gyromodel.estimate._rounding import as_read, step_of, unrounded, widened, with_reading
+from gyromodel.estimate._rounding import as_read, step_of, unrounded, widened, with_reading, with_step_of
 from gyromodel.model import GyroModel, ModelError, check_domain, check_units
 from gyromodel.noise import NoiseRatios, from_grams, markov_sum, stated_ratios
 from gyromodel.numerics.least_squares import Normal, Solution, levenberg_marquardt
@@ -65,6 +65,7 @@ def fit(
     given = [campaigns] if isinstance(campaigns, Campaign) else campaigns
     record = read_for_fit(given)
     refuse_apart(given, model)
+    model = with_step_of(model, given)
     if progress:
         progress("fitting", 0.1)
     estimate = with_noise_intervals(fit_record(record, model, solver=solver))
@@ -167,7 +168,7 @@ def _fit_readings(
             estimate = fit(found.record, replace(found.estimate.model, noise=bare.noise), ratios=ratios)
         if found.changed or found.stuck:
             estimate = widened(record, estimate, step, found.stuck)
-    return with_reading(estimate, reading, model)
+    return with_reading(estimate, reading, model, record)
 
 
 def _in_turns(

@@ -138,8 +138,7 @@ def with_noise_intervals(estimate: Estimate) -> Estimate:
     spans = {k: (float(v.min()), float(v.max())) for k, v in noise_coefficients(ratios, white, record, gain).items()}
     low, high = spans["noise_white"]
     scatter = 1.96 / float(np.sqrt(2 * (record.present.sum() - 1)))
-    low, high = low * (1 - scatter), high * (1 + scatter)
-    spans["noise_white"] = white_before(estimate, low), white_before(estimate, high)
+    spans["noise_white"] = white_before(estimate, (low * (1 - scatter), high * (1 + scatter)))
     if len(grid.flicker) == 1:
         # So few samples show no colour: there may be any amount of it.
         spans |= {name: (0.0, np.inf) for name in spans if name != "noise_white"}

@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
+from gyromodel.campaign import Campaign
 from gyromodel.effects.converter import Quantisation
-from gyromodel.estimate._estimate import Estimate
-from gyromodel.model import GyroModel, ModelError
-from gyromodel.numerics.rounding import noise_before, rounded_variance, staircase
+from gyromodel.estimate._estimate import Estimate, EstimateError
+from gyromodel.model import GyroModel, ModelError, check_reading
+from gyromodel.numerics.rounding import grid_step, noise_at, noise_before, rounded_variance, staircase
 from gyromodel.signals import Record
-from gyromodel.units import convertible
+from gyromodel.units import convertible, factor, internal_unit
 
 # Noise (steps) that leaves next to nothing of the saw tooth of rounding; steps that an output must move over, as what
 # is read within one is the same wherever the gyro is, and places (apart by the noise) that it must stand at.
 SMEARED, FEWEST_STEPS, FEWEST_PLACES = 0.5, 4.0, 12
 # Noise (steps) and places from which on what rounding adds is told well enough for nothing of it to be left.
 SHARP, MANY_PLACES = 0.12, 40
+OPEN = "the output comes in no steps: give quantisation a step, or leave it out"
 # How well the places of what is read must agree for it to be on a grid; one is perfectly.
 ON_GRID = 0.95
 # Residuals (steps) of a wider range are of three levels or more.
@@ -67,15 +69,15 @@ def unrounded(record: Record, estimate: Estimate, step: float, refit: Callable[[
         refit: the same model's fit to other data.
     """
     first, step, present = estimate, float(step), np.asarray(record.sampling.present)
-    output = np.asarray(record.signals["output"]) / step
-    turns = np.exp(2j * np.pi * output[present]).mean()
-    if np.abs(turns) < ON_GRID:
+    output, offset = np.asarray(record.signals["output"]) / step, _offset(record, step)
+    if offset is None:
         return Unrounded(record, first)
-    offset, added, last, plain = np.angle(turns) / (2.0 * np.pi), np.zeros_like(output), None, np.inf
+    added, last, plain = np.zeros_like(output), None, np.inf
     for turn in range(TURNS):
         at = np.where(present, np.asarray(estimate.model.predict(record.signals)) / step - offset, 0.0)
         variance = float(np.mean((output - offset - at - added)[present] ** 2))
-        noise, plain = noise_before(variance), variance if last is None else plain
+        plain = variance if last is None else plain
+        noise = noise_before(variance) if last is None else noise_at(at[present], variance)
         if noise > SMEARED:
             return Unrounded(record, first)
         places = len(np.unique(_places(at[present], noise)))
@@ -87,7 +89,11 @@ def unrounded(record: Record, estimate: Estimate, step: float, refit: Callable[[
         # Half of the way: where an edge is steep, the whole way there would be too far.
         added = staircase(at, noise) if last is None else 0.5 * (added + staircase(at, noise))
         corrected = record._replace(signals=record.signals | {"output": jnp.asarray((output - added) * step)})
-        before, last = np.asarray(estimate.model.vector()), refit(corrected)
+        before = np.asarray(estimate.model.vector())
+        try:
+            last = refit(corrected)
+        except EstimateError:
+            return Unrounded(record, first)
         moved = np.abs(np.asarray(last.model.vector()) - before)
         estimate = last
         if turn and (moved <= SETTLED * last.std).all():
@@ -105,10 +111,14 @@ def widened(record: Record, estimate: Estimate, step: float, stuck: bool) -> Est
     Samples that stand at one place tell together where in its step that is, and nothing where they read the same.
     Where all are stuck, the error of rounding is the same for all, at its worst.
     """
+    if not estimate.model.slots():
+        return estimate
     present = np.asarray(record.sampling.present)
     predicted, jacobian = (np.asarray(part)[present] / step for part in estimate.model.linearise(record.signals))
     residual, read = (np.asarray(r.signals["output"])[present] / step for r in (estimate.record, record))
     residual = residual - predicted
+    size = np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
+    jacobian = jacobian / size
     inverse = np.linalg.pinv(jacobian.T @ jacobian)
     plain = np.diag(inverse) * np.mean(residual**2)
     noise = max(noise_before(float(np.mean(residual**2))), LEAST_NOISE)
@@ -119,7 +129,7 @@ def widened(record: Record, estimate: Estimate, step: float, stuck: bool) -> Est
         tooth = tooth if np.ptp(residual) > TWO_LEVELS else 1.0 / 12.0
         wide = plain + np.sum(np.abs(inverse @ jacobian.T), axis=1) ** 2 * tooth
     else:
-        at = predicted - np.angle(np.exp(2j * np.pi * read).mean()) / (2.0 * np.pi)
+        at = predicted - (_offset(record, step) or 0.0)
         slope = 1.0 + (staircase(at + LEAST_NOISE, noise) - staircase(at - LEAST_NOISE, noise)) / (2.0 * LEAST_NOISE)
         bread = np.linalg.pinv(jacobian.T @ (np.maximum(slope, LEAST_SLOPE)[:, None] * jacobian))
         meat = jacobian * residual[:, None]
@@ -132,9 +142,16 @@ def widened(record: Record, estimate: Estimate, step: float, stuck: bool) -> Est
         same = np.mean(ends[1] - ends[0] < 0.5)
         wide = np.maximum(plain, np.diag(bread @ (meat.T @ meat) @ bread))
         wide = wide + np.diag(spread) * min(1.0, PLACES / len(count)) * same**2
-    own = np.diag(estimate.covariance)
+    own = np.diag(estimate.covariance) * size**2
     factor = np.sqrt(1.0 + np.maximum(wide - plain, 0.0) / own)
     return replace(estimate, covariance=estimate.covariance * np.outer(factor, factor))
+
+
+def _offset(record: Record, step: float) -> float | None:
+    """Where the grid lies on which an output was read, in steps from zero; None where it lies on none."""
+    output = np.asarray(record.signals["output"])[np.asarray(record.sampling.present)] / step
+    turns = np.exp(2j * np.pi * output).mean()
+    return float(np.angle(turns)) / (2.0 * np.pi) if np.abs(turns) > ON_GRID else None
 
 
 def _saw_tooth(noise: float) -> float:
@@ -148,17 +165,37 @@ def _places(at: np.ndarray, noise: float) -> np.ndarray:
 
 
 def step_of(model: GyroModel, record: Record) -> float:
-    """The step (output unit) in which a model reads a record's output; zero where it reads no rates.
+    """The step (output unit) in which a model reads a record's output; zero where it is an angle that is read.
 
     Raises:
-        ModelError: it states none, and the output shows none.
+        ModelError: it states none.
     """
     reading = model.reading
-    if reading is None or not (not reading.unit or convertible(reading.unit, record.output_unit)):
+    if reading is None or (reading.unit and not convertible(reading.unit, record.output_unit)):
         return 0.0
     if not np.isfinite(float(reading.step)):
-        raise ModelError("the output comes in no steps: give quantisation a step, or leave it out")
+        raise ModelError(OPEN)
     return float(reading.step)
+
+
+def with_step_of(model: GyroModel, campaigns: Sequence[Campaign]) -> GyroModel:
+    """The model with the steps of the campaigns' output where it leaves them open.
+
+    Raises:
+        ModelError: they show none, or the model states them in a unit other than the output's.
+    """
+    reading, unit = model.reading, campaigns[0].units.get("output", "")
+    if reading is None:
+        return model
+    if np.isfinite(float(reading.step)):
+        if unit:
+            check_reading(reading, unit)
+        return model
+    step = grid_step(campaigns[0].columns["output"]) if unit else None
+    if step is None:
+        raise ModelError(OPEN)
+    internal = jnp.asarray(step * factor(unit, internal_unit(unit)))
+    return model.with_effect(replace(reading, step=internal, unit=unit))
 
 
 def as_read(model: GyroModel, record: Record, step: float) -> GyroModel:
@@ -168,13 +205,20 @@ def as_read(model: GyroModel, record: Record, step: float) -> GyroModel:
     model = model.without(model.reading.label)
     if not model.noise or not step:
         return model
-    unit = step * np.sqrt(record.interval) / abs(float(model.gain()))
+    unit = _unit(model, record, step)
     white = unit * np.sqrt(rounded_variance(float(model.noise["noise_white"]) / unit))
     return replace(model, noise={**model.noise, "noise_white": jnp.asarray(white)})
 
 
-def with_reading(estimate: Estimate, reading: Quantisation, stated: GyroModel) -> Estimate:
-    """The fit with its model read in steps again, where `stated` has that; its noise is the one before rounding."""
+def with_reading(estimate: Estimate, reading: Quantisation, stated: GyroModel, record: Record) -> Estimate:
+    """The fit with its model read in steps again; its noise is the one before rounding.
+
+    Args:
+        estimate: of a model without it.
+        reading: the steps.
+        stated: the model whose noise was stated, if it was, and which has the reading at its place, if it has.
+        record: as it was read.
+    """
     model = estimate.model
     place = stated.labels.index(reading.label) if reading.label in stated.labels else len(model.effects)
     effects = (*model.effects[:place], reading, *model.effects[place:])
@@ -182,19 +226,39 @@ def with_reading(estimate: Estimate, reading: Quantisation, stated: GyroModel) -
     estimate = replace(estimate, model=model)
     if estimate.noise_given:
         return estimate
-    white = white_before(estimate, float(model.noise["noise_white"]))
-    model = replace(model, noise={**model.noise, "noise_white": jnp.asarray(white)})
+    step = step_of(model, record)
+    if not step:
+        return estimate
+    unit, white, present = (
+        _unit(model, record, step),
+        float(model.noise["noise_white"]),
+        np.asarray(record.sampling.present),
+    )
+    at = np.asarray(model.predict(record.signals))[present] / step - (_offset(record, step) or 0.0)
+    before = unit * max(noise_at(at, (white / unit) ** 2), LEAST_NOISE)
+    model = replace(model, noise={**model.noise, "noise_white": jnp.asarray(before)})
     interval = dict(estimate.noise_interval)
+    estimate = replace(estimate, model=model)
     if interval:
-        low, high = interval["noise_white"]
-        interval["noise_white"] = white_before(estimate, low), white_before(estimate, high)
-    return replace(estimate, model=model, noise_interval=interval)
+        interval["noise_white"] = white_before(estimate, interval["noise_white"])
+    return replace(estimate, noise_interval=interval)
 
 
-def white_before(estimate: Estimate, coefficient: float) -> float:
-    """The white noise before the output is read in steps, of that as it is read (both as input rates)."""
+def white_before(estimate: Estimate, interval: tuple[float, float]) -> tuple[float, float]:
+    """The interval of the white noise before the output is read in steps, of that as it is read (as input rates)."""
     step = step_of(estimate.model, estimate.record)
     if not step:
-        return coefficient
-    unit = step * np.sqrt(estimate.record.interval) / abs(float(estimate.model.gain()))
-    return float(unit * max(noise_before((coefficient / unit) ** 2), LEAST_NOISE))
+        return interval
+    unit = _unit(estimate.model, estimate.record, step)
+    gain, time = abs(float(estimate.model.gain())), estimate.record.interval
+    # Of places anywhere within steps, in proportion to what those of the record tell.
+    white = np.sqrt(estimate.white_variance * time) / gain
+    low, own, high = (max(noise_before((v / unit) ** 2), LEAST_NOISE) for v in (interval[0], white, interval[1]))
+    told = float(estimate.model.noise["noise_white"])
+    return told * low / own, told * high / own
+
+
+def _unit(model: GyroModel, record: Record, step: float) -> float:
+    """White noise (as an input rate) of a step of a sample; records of means are of several samples each."""
+    interval = float(record.signals["_step"][0]) if "_step" in record.signals else record.interval
+    return step * np.sqrt(interval) / abs(float(model.gain()))

@@ -14,7 +14,7 @@ from gyromodel.averages import average
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis import added_tests
 from gyromodel.effects import Effect
-from gyromodel.estimate import check_covariates, filter_of, given_ratios, whiten_columns
+from gyromodel.estimate import as_read, check_covariates, filter_of, given_ratios, step_of, whiten_columns
 from gyromodel.model import GyroModel, ModelError, check_units
 from gyromodel.signals import OFF, read_signals, with_columns_known
 from gyromodel.study._budget import Budget
@@ -73,6 +73,7 @@ def information(
     model = model.prepared(record.signals)
     check_covariates(record, model)
     check_units(model, record.output_unit, record.units)
+    model = as_read(model, record, step_of(model, record))
     ratios = given_ratios(record, model)
     assert ratios is not None
     std = noise * float(model.noise["noise_white"]) / np.sqrt(record.interval) * abs(float(model.gain()))
