@@ -110,6 +110,8 @@ def excess_band(estimate: Estimate) -> str:
         return ""
     residual = estimate.whitened[record.present]
     most = TAIL * float(np.median(np.abs(residual))) / norm.isf(0.25)
+    if not most > 0.0:
+        return ""
     residual = np.clip(residual, -most, most)
     count = (len(residual) - 1) // 2
     total = np.concatenate([[0.0], np.cumsum(np.abs(np.fft.rfft(residual))[1 : count + 1] ** 2)])

@@ -161,7 +161,7 @@ def _spectral_fit(power: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, 
             each = part / level[:, None]
             odds = lines / (1.0 - lines) / np.sqrt(LINE) * np.exp(np.minimum(0.5 * each * (1.0 - 1.0 / LINE), 700.0))
             quiet = 1.0 / (1.0 + odds)
-            level = np.mean(part * (quiet + (1.0 - quiet) / LINE), axis=1)
+            level = np.maximum(np.mean(part * (quiet + (1.0 - quiet) / LINE), axis=1), 1e-300)
         each = part / level[:, None]
         odds = lines / (1.0 - lines) / np.sqrt(LINE) * np.exp(np.minimum(0.5 * each * (1.0 - 1.0 / LINE), 700.0))
         value = np.sum(np.log1p(odds) - 0.5 * each, axis=1) + len(power) * np.log(1.0 - lines)
