@@ -114,7 +114,7 @@ def diagnose(
     readings, given = data.readings, model
     model, reading = readings.bare(given, measured, record)
     session = laid_out(record, model, step=data.step)
-    if readings.coarse_beside(record, session.baseline) and _quantised_angle(session.baseline, session.threshold):
+    if readings.coarse_beside(record, session.baseline) and _quantised_angle(session.baseline):
         readings = replace(readings, step=0.0)
     rounding = readings.beside(record, session.baseline)
     session = over_unrounded(record, rounding, model) or session
@@ -297,10 +297,10 @@ def diagnose(
     return found
 
 
-def _quantised_angle(estimate: Estimate, threshold: float) -> bool:
-    """Whether it is the angle that is rounded, and not each rate for itself."""
+def _quantised_angle(estimate: Estimate) -> bool:
+    """Whether it is clearly the angle that is rounded, and not each rate for itself."""
     free = _with_noise_estimated(estimate)
-    return free is not None and quantisation(free, threshold) is not None
+    return free is not None and quantisation(free, FAINT) is not None
 
 
 def _refuse_missing(measured: Sequence[Campaign], data: Data, model: GyroModel) -> None:
