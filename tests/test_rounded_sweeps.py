@@ -27,9 +27,10 @@ def sweep(rng: np.random.Generator, *, line: np.ndarray | float = 0.0, step: flo
 def test_lines_of_rounding_are_not_named_a_periodic_bias(rng: np.random.Generator):
     """Samples every quarter of a step, on the way up as on the way down."""
     found = sweep(rng, step=0.05)
-    assert found.verdict in ("named", "ambiguous")
     assert "quantisation" in {c.effect for c in found.causes}
-    assert set(found.credible_set) - {"quantisation"} == set() or "quantisation" in found.credible_set
+    if found.verdict != "named" or len(found.causes) > 1:
+        assert found.verdict == "ambiguous"
+        assert "quantisation" in found.credible_set
 
 
 def test_a_line_larger_than_rounding_makes_is_named(rng: np.random.Generator):

@@ -9,12 +9,12 @@ from typing import Literal
 
 import numpy as np
 
-from gyromodel._checks import CampaignError, listed
-from gyromodel.averages import with_interval_rates
+from gyromodel._checks import listed
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._calibrate import null_scores, threshold_of
 from gyromodel.diagnosis._data import Data, read
 from gyromodel.diagnosis._gain import nested_gain, no_gain, not_measured
+from gyromodel.diagnosis._intervals import CLEARER, COUNTED, HALF, over_intervals
 from gyromodel.diagnosis._isolation import settling_test
 from gyromodel.diagnosis._misfit import excess_band, unexplained_axes
 from gyromodel.diagnosis._noise_causes import as_cause, quantisation, telegraph
@@ -38,15 +38,13 @@ from gyromodel.estimate import (
     Estimate,
     EstimateError,
     check_covariates,
-    filter_of,
     fit_record,
     refuse_apart,
     refuse_missing,
-    whiten_columns,
     with_noise_intervals,
     with_reading,
 )
-from gyromodel.model import GyroModel, ModelError
+from gyromodel.model import GyroModel
 from gyromodel.signals import with_columns_known
 from gyromodel.units import factor, from_internal
 
@@ -58,17 +56,6 @@ FOLD_NEARBY = 3.0
 SMOOTHED = (
     "Temperatures were smoothed: the error follows the smooth record better, so that the rest is noise of the "
     "thermometer, which the model adds where it is applied to temperatures as they were read."
-)
-# What outputs counted over intervals seem to have beside reference rates at the ends of these; and by how many nats
-# the means of the rates must be likelier, and that for each parameter more.
-LATE, CLEARER, PARAMETER = {"time_delay", "bandwidth"}, 2.0, 4.0
-COUNTED = (
-    "The output counts over the interval before each row, and is late by half of it beside rates at its end: the means "
-    "of the reference rates over the intervals were taken, which are likelier."
-)
-HALF = (
-    "The output may count over the interval before each row, and be late by half of it beside rates at its end: these "
-    "data do not say, and what was found would hold it."
 )
 
 
@@ -287,7 +274,9 @@ def diagnose(
         baseline=baseline,
         extended=extended,
     )
-    if record.domain == "gyro" and (counted := _over_intervals(found, measured, given)):
+    if record.domain == "gyro" and (
+        counted := over_intervals(found, measured, lambda whole: diagnose(whole, given, hold_out=False))
+    ):
         whole, likelier = counted
         if likelier > CLEARER:
             again = diagnose(whole, given, hold_out=hold_out, calibrate=calibrate, seed=seed)
@@ -312,46 +301,6 @@ def _refuse_missing(measured: Sequence[Campaign], data: Data, model: GyroModel) 
         for effect in model.effects:
             for name in set(model.columns_needed(effect)) & set(campaign.columns):
                 refuse_missing(effect.label, name, campaign.columns[name], np.isfinite(campaign.columns["output"]))
-
-
-def _over_intervals(
-    found: Diagnosis, measured: Sequence[Campaign], model: GyroModel
-) -> tuple[list[Campaign], float] | None:
-    """Increments and angles beside means of the rates over their intervals, and by how many nats they are likelier so.
-
-    Asked where a delay or a bandwidth was found: those are what means have beside rates at the ends of intervals.
-    """
-    late = LATE & {c.effect for c in found.causes}
-    if not late or measured[0].metadata.get("kind") == "rate" or "rate" not in measured[0].columns:
-        return None
-    whole = [with_interval_rates(c) for c in measured]
-    try:
-        again = diagnose(whole, model, hold_out=False)
-    except (CampaignError, EstimateError, ModelError):
-        return None
-    return whole, _likelier(found.extended, again.extended)
-
-
-def _likelier(one: Estimate, other: Estimate) -> float:
-    """By how many nats another fit of the same outputs is likelier, less what further parameters are worth.
-
-    Each in the noise of either, on the rows that both have.
-    """
-    if one.record.rows != other.record.rows:
-        return -np.inf
-    lacking = np.flatnonzero(~(one.record.present & other.record.present))
-    best = []
-    for estimate in (one, other):
-        record = estimate.record.without(lacking)
-        left = record.signals["output"] - estimate.model.predict(record.signals)
-        each = []
-        for ratios in (one.ratios, other.ratios):
-            filter = filter_of(record, ratios)
-            squares = float(np.sum(np.asarray(whiten_columns(filter, left[:, None])) ** 2))
-            each.append(-0.5 * (record.present.sum() * np.log(squares) + float(filter.log_determinant)))
-        best.append(max(each))
-    more = len(other.model.slots()) - len(one.model.slots())
-    return best[1] - best[0] - PARAMETER * more
 
 
 def _finished(estimate: Estimate, ordinary: bool) -> Estimate:

@@ -17,23 +17,21 @@ from gyromodel.diagnosis._exchange import uncontested
 from gyromodel.diagnosis._points import levels
 from gyromodel.diagnosis._ranking import SLOW_IN_TIME, TIME_MARGIN, Ranking, is_driver, is_noise, special_cases
 from gyromodel.diagnosis._result import CREDIBLE, VAGUE, Cause, ParameterValue, Verdict
+from gyromodel.diagnosis._rounded import curve_of_rounding, no_farther, no_larger, of_rounding
 from gyromodel.diagnosis._said import places, told, told_of_cause, told_of_rest
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import Selection
-from gyromodel.diagnosis._shapes import driver_shape, remaining
+from gyromodel.diagnosis._shapes import remaining
 from gyromodel.diagnosis._steps import Found, Steps
 from gyromodel.effects._shapes import beyond_earth
 from gyromodel.effects.drivers import BiasPeriodic
 from gyromodel.estimate import Estimate
 from gyromodel.model import effect_class
-from gyromodel.numerics.rounding import quantum
 from gyromodel.signals import Record
 from gyromodel.units import factor
 
 # Where the noise is slow even with them, these have no edge that a random walk could not make, whatever their lead.
 NO_EDGE = ("bias_drift", "bias_warmup")
-# Times the saw tooth of rounding that what it makes may be.
-ROUNDED = 2.0
 # Nats below which a cause is faint, and times that by which a stronger one of the same thermometer outdoes it.
 FAINT, OUTDONE = 10.0, 10.0
 # What makes lines at each harmonic of a ramp, of which its form holds a few.
@@ -140,7 +138,7 @@ def judge(
     if selection.remains and not selection.unresolved:
         findings.append(told_of_rest(selection, extended))
     driver, share = remaining(scanner, steps.baseline, selection)
-    if driver and _curve_of_rounding(steps, selection, driver, saw_tooth):
+    if driver and curve_of_rounding(steps, selection, driver, saw_tooth):
         findings.append(
             f"What follows {' and '.join(smooth_columns(driver))} is no larger than what rounding makes: finer steps "
             "of the output would tell."
@@ -209,37 +207,13 @@ def _members(
             return members if scanner.by_points else {}
         own = {k: 0.5 * share for k, share in members.items()}
         members = own | {k: 0.5 / len(rivals) + own.get(k, 0.0) for k in rivals}
-    if isinstance(step.effect, BiasPeriodic) and _of_rounding(extended):
+    if isinstance(step.effect, BiasPeriodic) and of_rounding(extended):
         members = {k: 0.5 * share for k, share in members.items()} | {"noise_quantisation": 0.5}
-    if saw_tooth and step.points and _farthest(extended, step.points) < ROUNDED * saw_tooth:
+    if saw_tooth and step.points and no_farther(extended, step.points, saw_tooth):
         return {}
-    if saw_tooth and step.effect is not None and _reach(extended, name) < ROUNDED * saw_tooth:
+    if saw_tooth and step.effect is not None and no_larger(extended, name, saw_tooth):
         members = {k: 0.5 * share for k, share in members.items()} | {"quantisation": 0.5}
     return members
-
-
-def _curve_of_rounding(steps: Steps, selection: Selection, driver: str, saw_tooth: float) -> bool:
-    """Whether a curve may be what rounding has left."""
-    if not saw_tooth:
-        return False
-    curve = driver_shape(steps.scanner, selection, driver, steps.scanner.record.input_unit).y
-    return bool(abs(float(selection.estimate.model.gain())) * np.ptp(curve) < ROUNDED * saw_tooth)
-
-
-def _farthest(estimate: Estimate, rows: Sequence[int]) -> float:
-    """How far the farthest of some rows that were given up lies from the model."""
-    signals = estimate.record.signals
-    left = np.asarray(signals["output"] - estimate.model.predict(signals))
-    return float(np.abs(left[list(rows)]).max())
-
-
-def _reach(estimate: Estimate, name: str) -> float:
-    """The most that an effect does to the output."""
-    signals, model = estimate.record.signals, estimate.model
-    if name not in model.labels:
-        return np.inf
-    change = np.asarray(model.predict(signals) - model.without(name).predict(signals))
-    return float(np.abs(change[: estimate.record.rows][estimate.record.present]).max())
 
 
 def _with_doubts(
@@ -296,22 +270,6 @@ def _left_by(cause: Cause, causes: Sequence[Cause], estimate: Estimate, vague: b
     least = (1.0 if vague else OUTDONE) * cause.statistic
     others = [c for c in causes if c.statistic > least and own & needs.get(c.effect, set())]
     return {max(others, key=lambda c: c.statistic).effect: 0.5} if others else {}
-
-
-def _of_rounding(estimate: Estimate) -> bool:
-    """Whether rounding alone makes lines as large as the strongest, of rates or of the angle behind them."""
-    record, gain = estimate.record, abs(float(estimate.model.gain()))
-    lines = [e for e in estimate.model.effects if isinstance(e, BiasPeriodic)]
-    output = np.asarray(record.signals["output"])[: record.rows][record.present]
-    step = quantum(output)
-    if step is None or not lines:
-        return False
-    # The fundamental of the saw tooth, less by what noise of the unrounded output smears of it; at least of an angle's,
-    # whose differences have twice the variance of its rounding.
-    noise = max(estimate.white_variance - step**2 / 6.0, 0.0)
-    tooth = step / np.pi * np.exp(-2.0 * np.pi**2 * noise / step**2)
-    strongest = max(float(np.hypot(e.cosine, e.sine).max()) for e in lines)
-    return bool(gain * strongest < ROUNDED * tooth)
 
 
 def _fitted(cause: Cause) -> list[ParameterValue]:

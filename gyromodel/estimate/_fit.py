@@ -15,11 +15,10 @@ from gyromodel._checks import CampaignError
 from gyromodel.attitude import refuse_navigated, with_reference_rates
 from gyromodel.averages import MEAN_OF_ATTITUDE, average
 from gyromodel.campaign import Campaign
-from gyromodel.effects.converter import Quantisation
 from gyromodel.estimate._estimate import Estimate, EstimateError, noise_coefficients
 from gyromodel.estimate._noise import best_ratios, settled, with_noise_intervals
 from gyromodel.estimate._optimistix import optimistix_solution
-from gyromodel.estimate._rounding import as_read, step_of, unrounded, widened, with_reading, with_step_of
+from gyromodel.estimate._rounding import fit_readings, with_step_of
 from gyromodel.model import GyroModel, ModelError, check_domain, check_units
 from gyromodel.noise import NoiseRatios, from_grams, markov_sum, stated_ratios
 from gyromodel.numerics.least_squares import Normal, Solution, levenberg_marquardt
@@ -122,7 +121,7 @@ def fit_record(
     check_enough(record, len(model.slots()))
     if model.reading is not None:
         again = partial(fit_record, start=start, markov=markov, solver=solver, ordinary=ordinary)
-        return _fit_readings(record, model, model.reading, ratios, again)
+        return fit_readings(record, model, model.reading, ratios, again)
     given = given_ratios(record, model) if ratios is None else ratios
     white = NoiseRatios(jnp.zeros(()), jnp.zeros(()))
     shapes = not all(slot.linear for slot in model.slots())
@@ -149,26 +148,6 @@ def fit_record(
         filter = filter_of(record, estimate.ratios)
         estimate = _finish(record, model, estimate.ratios, filter, solution, variance=estimate.white_variance)
     return estimate
-
-
-def _fit_readings(
-    record: Record, model: GyroModel, reading: Quantisation, ratios: NoiseRatios | None, fit: Callable[..., Estimate]
-) -> Estimate:
-    """As `fit_record`, of a model that reads its output in steps; `fit` fits one that does not."""
-    step = step_of(model, record)
-    bare = as_read(model, record, step)
-    estimate = fit(record, bare, ratios=ratios)
-
-    def refit(data: Record) -> Estimate:
-        return fit(data, estimate.model_as_given(), ratios=estimate.ratios)
-
-    if step:
-        found = unrounded(record, estimate, step, refit)
-        if found.changed:
-            estimate = fit(found.record, replace(found.estimate.model, noise=bare.noise), ratios=ratios)
-        if found.changed or found.stuck:
-            estimate = widened(record, estimate, step, found.stuck)
-    return with_reading(estimate, reading, model, record)
 
 
 def _in_turns(

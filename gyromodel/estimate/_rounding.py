@@ -13,6 +13,7 @@ from gyromodel.campaign import Campaign
 from gyromodel.effects.converter import Quantisation
 from gyromodel.estimate._estimate import Estimate, EstimateError
 from gyromodel.model import GyroModel, ModelError, check_reading
+from gyromodel.noise import NoiseRatios
 from gyromodel.numerics.rounding import grid_step, noise_at, noise_before, rounded_variance, staircase
 from gyromodel.signals import Record
 from gyromodel.units import convertible, factor, internal_unit
@@ -103,6 +104,26 @@ def unrounded(record: Record, estimate: Estimate, step: float, refit: Callable[[
         return Unrounded(record, first)
     few = bool(noise < SHARP or places < MANY_PLACES)
     return Unrounded(corrected, estimate, changed=True, saw_tooth=step * _saw_tooth(noise) if few else 0.0)
+
+
+def fit_readings(
+    record: Record, model: GyroModel, reading: Quantisation, ratios: NoiseRatios | None, fit: Callable[..., Estimate]
+) -> Estimate:
+    """As `fit_record`, of a model that reads its output in steps; `fit` fits one that does not."""
+    step = step_of(model, record)
+    bare = as_read(model, record, step)
+    estimate = fit(record, bare, ratios=ratios)
+
+    def refit(data: Record) -> Estimate:
+        return fit(data, estimate.model_as_given(), ratios=estimate.ratios)
+
+    if step:
+        found = unrounded(record, estimate, step, refit)
+        if found.changed:
+            estimate = fit(found.record, replace(found.estimate.model, noise=bare.noise), ratios=ratios)
+        if found.changed or found.stuck:
+            estimate = widened(record, estimate, step, found.stuck)
+    return with_reading(estimate, reading, model, record)
 
 
 def widened(record: Record, estimate: Estimate, step: float, stuck: bool) -> Estimate:
