@@ -13,7 +13,7 @@ import gyromodel as gm
 from gyromodel.diagnosis import Diagnosis
 from gyromodel.diagnosis._readings import _of_samples
 from gyromodel.effects.converter import Quantisation
-from gyromodel.estimate import Calibration
+from gyromodel.estimate import Calibration, fit_many, read_for_fit
 from gyromodel.model import ModelError
 from gyromodel.model_files import read_model, write_model
 from gyromodel.numerics.rounding import grid_step, noise_before, quantum, rounded_variance, staircase
@@ -322,10 +322,43 @@ def test_a_model_of_a_rounded_angle_is_kept_and_simulated(kind: str, tmp_path: P
 
 
 def test_campaigns_of_different_steps_are_said_not_to_be_searched():
+    """What they do to a curve over the rate is not told as anything else."""
     rng = np.random.default_rng(8)
-    two = [rest(rounded(0.01 + NOISE * rng.standard_normal(200), step)) for step in (0.01, 0.005)]
-    found = gm.diagnose(two, gm.model_from_effects(["bias"]), hold_out=False)
+    two = [levels(step, rng)[0] for step in (0.02, 0.03)]
+    model = gm.model_from_effects(["scale_factor", "bias"])
+    found = gm.diagnose(two, model, hold_out=False)
     assert "different steps" in found.not_testable["quantisation"]
+    assert found.verdict == "adequate" or "quantisation" in found.credible_set
+    assert any("steps of their own" in line for line in found.findings)
+    with pytest.raises(ModelError, match="read in different steps"):
+        gm.fit(two, gm.model_from_effects(["scale_factor", "bias", "quantisation"]))
+
+
+def test_a_step_that_the_data_are_not_read_in_takes_nothing_from_the_noise():
+    campaign = rest(0.01 + NOISE * np.random.default_rng(10).standard_normal(400))
+    model = gm.GyroModel((*gm.model_from_effects(["bias"]).effects, Quantisation(step=np.deg2rad(0.02), unit="deg/s")))
+    plain = gm.fit(campaign, gm.model_from_effects(["bias"])).noise_table()["noise_white"]
+    assert gm.fit(campaign, model).noise_table()["noise_white"] == pytest.approx(plain)
+    found = gm.diagnose(campaign, model, hold_out=False)
+    assert any("not read in the steps" in line for line in found.findings)
+    assert float(found.noise["noise_white"]["value"]) == pytest.approx(NOISE * 60.0, rel=0.15)
+
+
+def test_exact_outputs_of_even_rates_are_no_steps():
+    """Each rate several times and next to no noise: the grid is that of the rates."""
+    rate = np.tile(np.linspace(-20.0, 20.0, 5), 40)
+    columns = {"time": np.arange(200.0), "rate": rate, "output": 1.001 * rate}
+    campaign = gm.Campaign(columns, {"time": "s", "rate": "deg/s", "output": "deg/s"}, {"kind": "rate"})
+    found = gm.diagnose(campaign, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
+    assert "quantisation" not in {c.effect for c in found.causes}
+
+
+def test_many_campaigns_in_steps_are_fitted_one_at_a_time():
+    records = [read_for_fit([levels(0.02, np.random.default_rng(11))[0]])]
+    model = gm.model_from_effects(["scale_factor", "bias", "quantisation"])
+    fits = fit_many(records, gm.GyroModel(model.effects, {"noise_white": 6e-7}))
+    assert not fits.converged[0]
+    assert "one campaign at a time" in fits.reasons[0]
 
 
 def test_known_steps_leave_no_doubt_of_their_own(tmp_path: Path):

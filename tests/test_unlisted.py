@@ -110,6 +110,21 @@ def test_a_ripple_over_the_temperature_of_a_buried_place_follows_what_was_before
     assert followed(measured) == "temperature[earlier]"
 
 
+def test_a_curve_that_is_drawn_is_what_the_simulation_cannot_make(rng: np.random.Generator):
+    """Fringes over temperature less the line that a known bias over temperature takes of them, and their band."""
+    inside = chamber(rng)
+    fringes = 0.08 * np.sin(2 * np.pi * 4.3 * (inside - inside.min()) / np.ptp(inside) + rng.uniform(0.0, 6.0))
+    line = np.column_stack([np.ones(len(TIME)), inside])
+    apart = fringes - line @ np.linalg.lstsq(line, fringes, rcond=None)[0]
+    measured = log(0.5 + 0.02 * inside + fringes, rng, temperature=inside)
+    found = gm.diagnose(measured, gm.model_from_effects(["bias", "bias_temperature"]), hold_out=False)
+    assert found.driver is not None
+    order = np.argsort(inside)
+    missed = np.abs(found.driver.y - np.interp(found.driver.x, inside[order], apart[order]))
+    assert np.mean(missed < 3.0 * found.driver.std) > 0.9
+    assert np.median(found.driver.std) < 0.01
+
+
 def table(rng: np.random.Generator) -> np.ndarray:
     """Rates of a table in random order, 80 of 15 dwells each, in deg/s."""
     return np.repeat(rng.permutation(np.repeat(np.linspace(-100.0, 100.0, 16), 5)), 15)

@@ -85,7 +85,8 @@ def read(lot: Lot) -> list[Ready]:
 
 def _ready(head: Row, campaign: Campaign, lot: Lot) -> Ready:
     """Noise that is not stated takes nearly all of a fit's time, and is found one campaign at a time anyway."""
-    if lot.diagnosing or not lot.model.noise or len(campaign) > LONGEST or is_platform(campaign):
+    alone = lot.diagnosing or not lot.model.noise or lot.model.reading is not None
+    if alone or len(campaign) > LONGEST or is_platform(campaign):
         return Ready(head, campaign, None)
     try:
         return Ready(head, campaign, read_for_fit([campaign]))

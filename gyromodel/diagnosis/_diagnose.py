@@ -101,7 +101,9 @@ def diagnose(
     readings, given = data.readings, model
     model, reading = readings.bare(given, measured, record)
     session = laid_out(record, model, step=data.step)
-    if readings.coarse_beside(record, session.baseline) and _quantised_angle(session.baseline):
+    if readings.coarse_beside(record, session.baseline) and (
+        readings.mirrors(record, session.baseline) or _quantised_angle(session.baseline)
+    ):
         readings = replace(readings, step=0.0)
     rounding = readings.beside(record, session.baseline)
     session = over_unrounded(record, rounding, model) or session
@@ -112,10 +114,11 @@ def diagnose(
     selection = session.run(say)
     for _ in range(ROUNDINGS if selection.found else 0):
         # Rounding is another beside what was found.
-        rounding = readings.beside(record, selection.estimate)
-        again = over_unrounded(record, rounding, model, session.threshold)
+        beside = readings.beside(record, selection.estimate)
+        again = over_unrounded(record, beside, model, session.threshold)
         if again is None:
             break
+        rounding = beside
         names, session, selection = [f.name for f in selection.found], again, again.run(say)
         if [f.name for f in selection.found] == names:
             break
@@ -211,6 +214,10 @@ def diagnose(
         len(names),
     )
     coarse = rounding.changed or rounding.stuck or readings.coarse_beside(as_it_was, extended)
+    if readings.untested and rounding.saw_tooth:
+        findings.append("Campaigns are read in steps of their own: what is smaller than the coarsest may be rounding.")
+    if reading and readings.unit and not readings.untested and not read_so:
+        findings.append("The output is not read in the steps that the simulation states.")
     if coarse:
         if not read_so:
             judgement = with_steps(judgement, readings.as_cause(int(record.present.sum())))

@@ -22,13 +22,14 @@ from gyromodel.estimate import (
     widened,
     with_step_of,
 )
+from gyromodel.estimate._rounding import SAME, SMEARED, saw_tooth
 from gyromodel.model import GyroModel
-from gyromodel.numerics.rounding import grid_step
+from gyromodel.numerics.rounding import grid_step, noise_before
 from gyromodel.signals import Record
 from gyromodel.units import factor, from_internal, internal_unit
 
-# Steps that differ by less than this part are one.
-SAME = 0.01
+# Steps that an output of its inputs' grid moves over, and the part of one by which it then errs.
+FEWEST, TRUE = 2.0, 0.05
 # What each sample on a grid is worth (nats): as if it might have been written with one digit more.
 WORTH = float(np.log(10.0))
 # Differences of samples of this order hold noise and no motion; the sum of squares of their coefficients.
@@ -40,8 +41,8 @@ class Readings:
     """How a gyro's output is read.
 
     Attributes:
-        step: of the grid that it lies on, internal unit; zero where it lies on none, or its steps are not searched.
-        scatter: from sample to sample, where means are searched; zero where samples are.
+        step: of the grid that it lies on, internal unit, the coarsest of several; zero where it lies on none.
+        scatter: from sample to sample, where means are searched or steps differ; zero else.
         unit: of the output in its file.
         untested: why steps are not searched; empty where they are.
     """
@@ -57,9 +58,16 @@ class Readings:
         def refit(data: Record) -> Estimate:
             return fit_record(data, estimate.model_as_given(), ratios=estimate.ratios, solver="levenberg_marquardt")
 
-        if not self.step or self.scatter:
-            return Unrounded(record, estimate)
+        if not self.step or self.scatter or self.untested:
+            return Unrounded(record, estimate, saw_tooth=self._left_in_means())
         return unrounded(_as_read(record, estimate), estimate, self.step, refit)
+
+    def _left_in_means(self) -> float:
+        """What rounding may leave in means of samples, or where campaigns have steps of their own, peak to peak."""
+        if not (self.step and self.scatter):
+            return 0.0
+        noise = noise_before((self.scatter / self.step) ** 2)
+        return self.step * saw_tooth(noise) if noise < SMEARED else 0.0
 
     def widened(self, record: Record, estimate: Estimate, found: Unrounded) -> Estimate:
         """The fit with the covariance that steps leave it."""
@@ -80,11 +88,18 @@ class Readings:
                 f"The output is read in {step}, and moves over too few for the noise to tell more: what is smaller "
                 "than one may be rounding."
             )
+        if found.saw_tooth:
+            return f"The output is read in {step}, and its means may follow them: what is smaller may be rounding."
         return f"The output is read in {step}: rounding counts as white noise."
 
     def coarse_beside(self, record: Record, estimate: Estimate) -> bool:
         """Whether the steps are as large as what a fit leaves from sample to sample, or larger."""
-        return self.step > 0.0 and bool(self.step >= self._scatter(record, estimate))
+        return self.step > 0.0 and not self.untested and bool(self.step >= self._scatter(record, estimate))
+
+    def mirrors(self, record: Record, estimate: Estimate) -> bool:
+        """Whether the grid is that of the inputs: an output that moves over steps and errs by next to none of one."""
+        moved = np.ptp(np.asarray(estimate.model.predict(record.signals))[: record.rows][record.present])
+        return bool(moved > FEWEST * self.step and self._scatter(record, estimate) < TRUE * self.step)
 
     def _scatter(self, record: Record, estimate: Estimate) -> float:
         """From sample to sample, of the output as it was read beside a fit: slow noise is none of it."""
@@ -103,7 +118,8 @@ class Readings:
         if model.reading is None:
             return model, None
         model = with_step_of(model, campaigns).prepared(record.signals)
-        return as_read(model, record, step_of(model, record)), model.reading
+        step = step_of(model, record) if self.same_as(model.reading) else 0.0
+        return as_read(model, record, step), model.reading
 
     def least(self, record: Record, estimate: Estimate) -> float:
         """The smallest step that would be told, in the unit of the file."""
@@ -136,10 +152,9 @@ def readings_of(campaigns: Sequence[Campaign], searched: Sequence[Campaign]) -> 
     scales = [factor(c.units["output"], internal_unit(unit)) for c in campaigns]
     steps = [(grid_step(c.columns["output"]) or 0.0) * scale for c, scale in zip(campaigns, scales, strict=True)]
     means = any(len(s) < len(c) for c, s in zip(campaigns, searched, strict=True))
-    scatter = max(map(_of_samples, campaigns)) if means else 0.0
-    if min(steps) > (1.0 - SAME) * max(steps) > 0.0:
-        return Readings(steps[0], scatter, unit)
-    return Readings(0.0, scatter, unit, "campaigns are read in different steps" if max(steps) > 0.0 else "")
+    alike = min(steps) >= (1.0 - SAME) * max(steps)
+    scatter = max(map(_of_samples, campaigns)) if means or not alike else 0.0
+    return Readings(float(max(steps)), scatter, unit, "" if alike else "campaigns are read in different steps")
 
 
 def _of_samples(campaign: Campaign) -> float:

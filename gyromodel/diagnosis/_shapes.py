@@ -75,7 +75,10 @@ def driver_shape(scanner: Scanner, selection: Selection, name: str, unit: str) -
     variance = float(np.sum((w[:, -1] - w[:, :-1] @ (solution / norm)) ** 2)) / max(scanner.degrees_of_freedom - p, 1)
     covariance = inverse @ inverse.T * variance
     shape = columns[: record.rows] / norm[p:]
-    shape = shape - shape.mean(0)
+    # What the model's own parameters would make as well is no part of the curve.
+    own = np.column_stack([np.ones(record.rows), beside[: record.rows]])
+    own = own / np.maximum(np.linalg.norm(own, axis=0), 1e-300)
+    shape = shape - own @ np.linalg.lstsq(own, shape, rcond=1e-10)[0]
     value = shape @ solution[p:]
     std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", shape, covariance[p:, p:], shape), 0.0))
     form, explained, _ = ranking.best_form(name)

@@ -77,7 +77,7 @@ class Quantisation(Effect):
     id = "quantisation"
     site = "readout"
     needs = ()
-    cause = "The converter or the log holds the output in steps as large as its noise, or larger."
+    cause = "The converter or the log holds the output in steps larger than its noise."
     test = "Read the output in finer steps, or turn slowly through several: errors of rounding repeat with each step."
     held = ("step",)
 

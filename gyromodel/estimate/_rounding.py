@@ -30,6 +30,8 @@ ON_GRID = 0.95
 TWO_LEVELS = 2.0
 # Turns of fit and rounding, and the part of a standard deviation at which parameters are settled.
 TURNS, SETTLED = 12, 0.05
+# Steps that differ by less than this part are one.
+SAME = 0.01
 # Least noise before rounding that is told, in steps: zero is none that could be stated.
 LEAST_NOISE = 0.01
 # Places closer than this many steps are one however little noise there is; least slope of the staircase that a
@@ -85,7 +87,7 @@ def unrounded(record: Record, estimate: Estimate, step: float, refit: Callable[[
         if np.ptp(at[present]) < FEWEST_STEPS or places < FEWEST_PLACES:
             left = (output - offset - at)[present]
             return Unrounded(
-                record, first, stuck=True, saw_tooth=step * _saw_tooth(noise if np.ptp(left) > TWO_LEVELS else 0.0)
+                record, first, stuck=True, saw_tooth=step * saw_tooth(noise if np.ptp(left) > TWO_LEVELS else 0.0)
             )
         # Half of the way: where an edge is steep, the whole way there would be too far.
         added = staircase(at, noise) if last is None else 0.5 * (added + staircase(at, noise))
@@ -103,7 +105,7 @@ def unrounded(record: Record, estimate: Estimate, step: float, refit: Callable[[
     if np.mean((output - offset - at - added)[present] ** 2) >= plain:  # rounded otherwise than sample by sample
         return Unrounded(record, first)
     few = bool(noise < SHARP or places < MANY_PLACES)
-    return Unrounded(corrected, estimate, changed=True, saw_tooth=step * _saw_tooth(noise) if few else 0.0)
+    return Unrounded(corrected, estimate, changed=True, saw_tooth=step * saw_tooth(noise) if few else 0.0)
 
 
 def fit_readings(
@@ -111,6 +113,7 @@ def fit_readings(
 ) -> Estimate:
     """As `fit_record`, of a model that reads its output in steps; `fit` fits one that does not."""
     step = step_of(model, record)
+    step = step if step and _offset(record, step) is not None else 0.0
     bare = as_read(model, record, step)
     estimate = fit(record, bare, ratios=ratios)
 
@@ -175,7 +178,7 @@ def _offset(record: Record, step: float) -> float | None:
     return float(np.angle(turns)) / (2.0 * np.pi) if np.abs(turns) > ON_GRID else None
 
 
-def _saw_tooth(noise: float) -> float:
+def saw_tooth(noise: float) -> float:
     """Peak to peak, in steps, of what rounding adds on the average."""
     return float(np.ptp(staircase(np.linspace(0.0, 1.0, 201), noise)))
 
@@ -203,7 +206,7 @@ def with_step_of(model: GyroModel, campaigns: Sequence[Campaign]) -> GyroModel:
     """The model with the steps of the campaigns' output where it leaves them open.
 
     Raises:
-        ModelError: they show none, or the model states them in a unit other than the output's.
+        ModelError: they show none or different ones, or the model states them in a unit other than the output's.
     """
     reading, unit = model.reading, campaigns[0].units.get("output", "")
     if reading is None:
@@ -212,10 +215,13 @@ def with_step_of(model: GyroModel, campaigns: Sequence[Campaign]) -> GyroModel:
         if unit:
             check_reading(reading, unit)
         return model
-    step = grid_step(campaigns[0].columns["output"]) if unit else None
-    if step is None:
+    each = [grid_step(c.columns["output"]) if "output" in c.columns else None for c in campaigns]
+    steps = [s * factor(c.units["output"], internal_unit(unit)) for s, c in zip(each, campaigns, strict=True) if s]
+    if len(steps) < len(campaigns):
         raise ModelError(OPEN)
-    internal = jnp.asarray(step * factor(unit, internal_unit(unit)))
+    if min(steps) < (1.0 - SAME) * max(steps):
+        raise ModelError("the campaigns are read in different steps: fit them apart, or leave quantisation out")
+    internal = jnp.asarray(steps[0])
     return model.with_effect(replace(reading, step=internal, unit=unit))
 
 
@@ -247,16 +253,14 @@ def with_reading(estimate: Estimate, reading: Quantisation, stated: GyroModel, r
     estimate = replace(estimate, model=model)
     if estimate.noise_given:
         return estimate
-    step = step_of(model, record)
-    if not step:
+    step, means = step_of(model, record), "_step" in record.signals
+    offset = _offset(record, step) if step and not means else 0.0
+    if not step or offset is None:  # what is not read so has no noise before
         return estimate
-    unit, white, present = (
-        _unit(model, record, step),
-        float(model.noise["noise_white"]),
-        np.asarray(record.sampling.present),
-    )
-    at = np.asarray(model.predict(record.signals))[present] / step - (_offset(record, step) or 0.0)
-    before = unit * max(noise_at(at, (white / unit) ** 2), LEAST_NOISE)
+    unit, present = _unit(model, record, step), np.asarray(record.sampling.present)
+    variance = (float(model.noise["noise_white"]) / unit) ** 2
+    at = np.asarray(model.predict(record.signals))[present] / step - offset
+    before = unit * max(noise_before(variance) if means else noise_at(at, variance), LEAST_NOISE)
     model = replace(model, noise={**model.noise, "noise_white": jnp.asarray(before)})
     interval = dict(estimate.noise_interval)
     estimate = replace(estimate, model=model)
@@ -276,6 +280,8 @@ def white_before(estimate: Estimate, interval: tuple[float, float]) -> tuple[flo
     white = np.sqrt(estimate.white_variance * time) / gain
     low, own, high = (max(noise_before((v / unit) ** 2), LEAST_NOISE) for v in (interval[0], white, interval[1]))
     told = float(estimate.model.noise["noise_white"])
+    if np.isclose(told, white, rtol=1e-9):  # it is not read so
+        return interval
     return told * low / own, told * high / own
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from gyromodel._compiling import former_fusions
 from gyromodel.estimate._blocks import BLOCK, Blocks, gram_of, in_turn
 from gyromodel.estimate._fit import check_enough, given_ratios
-from gyromodel.model import GyroModel, check_units
+from gyromodel.model import GyroModel, ModelError, check_units
 from gyromodel.noise import NoiseRatios, markov_sum
 from gyromodel.numerics.compiled_least_squares import Search, search_minimum
 from gyromodel.numerics.state_space import Sampling, build_filter
@@ -67,6 +67,8 @@ def ready(place: int, record: Record, given: Prepared) -> Waiting:
     if units not in given.suit:
         check_units(given.model, record.output_unit, record.units)
         given.suit.add(units)
+    if given.model.reading is not None:
+        raise ModelError("an output that is read in steps is fitted one campaign at a time, by fit")
     model = GyroModel.prepared(given.model, record.signals)
     prepared = given if model is given.model else described(model)
     check_enough(record, len(prepared.start))
