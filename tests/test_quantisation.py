@@ -99,6 +99,11 @@ def test_steps_that_make_no_sense_are_refused(step: str, said: str, tmp_path: Pa
                read_model(model_file(tmp_path / "m.yaml", step)))  # fmt: skip
 
 
+def test_no_step_is_infinite():
+    with pytest.raises(ValueError, match="above zero and finite"):
+        Quantisation(step=np.inf)
+
+
 def test_a_model_without_a_step_takes_that_of_the_data(tmp_path: Path):
     rng = np.random.default_rng(5)
     campaign = rest(rounded(0.01 + NOISE * rng.standard_normal(300), 0.005))

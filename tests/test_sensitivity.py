@@ -20,6 +20,7 @@ from scipy.stats import norm
 
 from gyromodel import CampaignError, cli
 from gyromodel.campaign import Campaign
+from gyromodel.effects.converter import Quantisation
 from gyromodel.effects.drivers import Bias
 from gyromodel.effects.scale import ScaleFactor, ScaleNonlinearity, ScaleTemperature
 from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureRate
@@ -130,6 +131,15 @@ def averaged(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("averaged")
+def test_steps_of_the_output_are_noise_of_a_mission():
+    """A step much finer than the noise adds a twelfth of its square."""
+    white, step = WHITE / np.sqrt(STEP), 0.8 * WHITE / np.sqrt(STEP)
+    model = GyroModel((*THERMAL, Quantisation(step=step, unit="deg/s")), NOISE)
+    found = sensitivity(Calibration(model, COVARIANCE), mission(temperature=RAMP), ["rate"])
+    read = np.sqrt(white**2 + step**2 / 12)
+    assert found.results[0].budget.noise["noise_white"] * DEG_H == pytest.approx(read, rel=1e-3)
+
+
 def test_a_long_mission_has_the_noise_and_the_errors_of_its_samples():
     """The same ramp at a hundred times the rate, which is averaged: a rate's noise is that of one sample."""
     rows = 100 * ROWS + 100

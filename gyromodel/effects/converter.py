@@ -85,8 +85,8 @@ class Quantisation(Effect):
     unit: str = eqx.field(static=True, default="")
 
     def __check_init__(self) -> None:
-        if self.step <= 0:
-            raise ValueError("a step is above zero")
+        if self.step <= 0 or self.step == jnp.inf:
+            raise ValueError("a step is above zero and finite")
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """None."""

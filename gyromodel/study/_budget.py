@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from gyromodel.estimate import make_filter
+from gyromodel.estimate import as_read, make_filter, step_of
 from gyromodel.model import ModelError
 from gyromodel.noise import NoiseRatios, markov_sum, stated_ratios
 from gyromodel.numerics.state_space import colour
@@ -221,11 +221,15 @@ def _of_errors(
 
 
 def _each_axis(mission: Mission, record: Record, rows: np.ndarray | None) -> tuple[list[str], list[np.ndarray]] | None:
-    """By axis, the variance that each kind of noise causes in each entry; without rows, of each sample measured."""
+    """By axis, the variance that each kind of noise causes in each entry; without rows, of each sample measured.
+
+    Rounding of an output that is read in steps counts as white noise.
+    """
     found = []
     for axis, model in enumerate(mission.models):
         if not model.noise:
             return None
+        model = as_read(model, record, step_of(model, record))
         try:
             ratios = stated_ratios(model.noise, record.interval)
         except ValueError as problem:
