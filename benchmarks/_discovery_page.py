@@ -15,6 +15,8 @@ from benchmarks._discovery_figures import draw_confusion, draw_power
 from benchmarks._kept import Kept, code
 from tests.truth import levels, study
 from tests.truth.campaigns import HOMES, MOTION, TESTABLE
+from tests.truth.laws import Told
+from tests.truth.noise import FAMILY
 from tests.truth.verdicts import Score, allowed
 
 # In multiples of the minimal detectable size.
@@ -22,6 +24,8 @@ SIZES = (0.5, 1.0, 2.0, 3.0, 10.0)
 # Channels that a campaign measures, of those that unknown effects follow.
 MEASURED = ("temperature", "rate", "supply_voltage", "pressure")
 WALK = "noise_random_walk"
+# Row 18: processor seconds that must do, and that are wished for.
+MUST_SECONDS, GOAL_SECONDS = 60.0, 10.0
 TIMED_DRAWS = 2000  # of the calibration of a diagnosis that is timed
 HEAD = [
     "| row | measure | prototype | must | measured (95 % interval) | n | | goal |",
@@ -48,7 +52,7 @@ def write_page(output: Path, whole: list[Kept]) -> None:
     uniform, lowest, count = levels.uniform_p_values(parts["calibrated"])
     size, error = levels.mean_set_size(sized[3.0])
     at_three = sum(r.isolable for r in sized[3.0])
-    kinds = [kind for k in whole for kind in k.kinds]
+    told = {label: [t for k in whole for t in k.oracle.get(label, [])] for label in parts}
     controls, control_checks = _controls(nulls, sized[3.0], unknown[3.0])
     tenth = binomtest(round(lowest * count), count, 0.1).pvalue > 0.05
     small, three = size - 1.96 * error <= levels.SET_SIZE, f"{size:.2f} ± {error:.2f}"
@@ -60,7 +64,7 @@ def write_page(output: Path, whole: list[Kept]) -> None:
         _spent(whole[-1].seconds),
         *(_leak(sized[s], s) for s in (1.0, 3.0)),
         *_beside_names(sized[1.0]),
-        _kinds_told(kinds),
+        *_bounds(parts, told),
         *control_checks,
         *mutant_checks,
     ]
@@ -73,6 +77,7 @@ def write_page(output: Path, whole: list[Kept]) -> None:
         "",
         f"{sum(map(len, parts.values()))} campaigns, by the engine {made}{other} (digests: `benchmarks/_kept.py`; of",
         "several, each made some of the parts).",
+        *_still(whole),
         "Made by",
         "",
         *commands,
@@ -133,6 +138,15 @@ def write_page(output: Path, whole: list[Kept]) -> None:
     draw_confusion(sized[3.0] + unknown[3.0], figures["confusion"])
     p_values = np.array([r.answer.p_value for r in parts["calibrated"] if r.answer])
     draw_power([r for records in sized.values() for r in records], p_values, figures["power"])
+
+
+def _still(whole: list[Kept]) -> list[str]:
+    """How many answers are still those of an engine that came later."""
+    return [
+        f"Of {total} of them, drawn at random and diagnosed again by {engine}, {other} have another answer (verdict, "
+        "names or column)."
+        for engine, total, other in (k.again for k in whole if k.again)
+    ]
 
 
 def _row(v: levels.Level) -> str:
@@ -281,11 +295,28 @@ def _beside_names(records: list[study.Record]) -> list[str]:
     return [f"| 5 | {k} | – | – | {100 * n / max(m, 1):.1f} % | {m} | – | |" for k, (n, m) in counted.items()]
 
 
-def _kinds_told(kinds: list[tuple[str, str]]) -> str:
-    """Row 14 of an oracle that knows how the levels of the noise are drawn, on the same campaigns."""
-    right = sum(said == drawn for drawn, said in kinds)
-    measured = f"{100 * right / max(len(kinds), 1):.1f} %"
-    return f"| 14 | what bounds it: noise class by an oracle | – | – | {measured} | {len(kinds)} | – | |"
+def _bounds(parts: dict[str, list[study.Record]], told: dict[str, list[Told]]) -> list[str]:
+    """Rows 1, 2, 8, 12 and 14 of an oracle that knows how levels are drawn, as sure as the engine, on the same data."""
+    nulls = [pair for k in ("nothing", "nothing, moving") for pair in zip(parts[k], told[k], strict=False)]
+    counted = {("1", "something said, nothing hidden, noise of the family"): [bool(t.said) for _, t in nulls]}
+    for noise in FAMILY:
+        counted["2", f"something said, {noise.replace('_', ' ')}"] = [
+            bool(t.said) for r, t in nulls if r.case.noise == noise
+        ]
+    counted["8", "told by its own shape, no other name beside, 10×"] = [
+        t.said == (r.case.effect,) for r, t in zip(parts["unknown 10"], told["unknown 10"], strict=False)
+    ]
+    counted["12", "ambiguous with the truth"] = [
+        len(t.said) > 1 and r.case.effect in t.said
+        for r, t in zip(parts["inseparable"], told["inseparable"], strict=False)
+    ]
+    counted["14", "noise class"] = [max(t.kinds, key=t.kinds.__getitem__) == r.case.noise for r, t in nulls]
+    return [
+        f"| {row} | what bounds it: {measure}, by an oracle that knows how levels are drawn | – | – | "
+        f"{100 * np.mean(flags):.1f} % | {len(flags)} | – | |"
+        for (row, measure), flags in counted.items()
+        if flags
+    ]
 
 
 def _mutants(parts: dict[str, list[study.Record]]) -> tuple[list[str], list[str]]:
@@ -313,12 +344,16 @@ def _mutants(parts: dict[str, list[study.Record]]) -> tuple[list[str], list[str]
     return lines, checks
 
 
-def _spent(seconds: Sequence[tuple[str, int, float]]) -> str:
+def _spent(seconds: Sequence[tuple[str, int, float, float]]) -> str:
     """Row 18 of what was timed."""
-    each = ", ".join(f"{name} ({rows} rows) {spent:.0f}" for name, rows, spent in seconds)
-    most = max(spent for _, _, spent in seconds)
-    measure = f"processor seconds with {TIMED_DRAWS} draws and hold-out, the longest: {each}"
-    return _check("18", measure, "≤ 60 s", f"{most:.0f} s", len(seconds), most <= 60.0)
+    each = ", ".join(f"{name} ({rows} rows) {one:.0f} and {two:.0f}" for name, rows, one, two in seconds)
+    first, then = (max(row[i] for row in seconds) for i in (2, 3))
+    measure = f"processor seconds with {TIMED_DRAWS} draws and hold-out, the first time and compiled before: {each}"
+    must, goal = ("met" if first <= MUST_SECONDS else "**missed**"), ("met" if then <= GOAL_SECONDS else "missed")
+    return (
+        f"| 18 | {measure} | 6 s | ≤ {MUST_SECONDS:g} s | {first:.0f} s, then {then:.0f} s | {len(seconds)} | {must} | "
+        f"{GOAL_SECONDS:g} s, compiled before: {goal} |"
+    )
 
 
 def _never_hidden() -> list[str]:

@@ -14,6 +14,7 @@ import numpy as np
 
 from tests.truth.campaigns import Truth
 from tests.truth.contest import Control
+from tests.truth.laws import Told
 from tests.truth.study import Case, Record
 from tests.truth.verdicts import Answer, Score
 
@@ -36,22 +37,24 @@ def code() -> str:
 
 
 class Kept:
-    """The parts of a study with one seed: records by label, noise as an oracle tells it, what one process timed."""
+    """The parts of a study with one seed: records by label, what an oracle tells of some, what one process timed."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         stored = json.loads(gzip.decompress(path.read_bytes())) if path.exists() else {}
         self.code: str = stored.get("code", "")
         self.scale: float = stored.get("scale", 0.0)
-        self.seconds: list[tuple[str, int, float]] = [tuple(row) for row in stored.get("seconds", [])]
-        self.kinds: list[tuple[str, str]] = [tuple(row) for row in stored.get("kinds", [])]
+        self.seconds: list[tuple[str, int, float, float]] = [tuple(row) for row in stored.get("seconds", [])]
+        self.oracle = {label: [Told(**t) for t in told] for label, told in stored.get("oracle", {}).items()}
+        self.again: tuple[str, int, int] | None = tuple(stored["again"]) if stored.get("again") else None
         self.parts = {label: [_record(r) for r in records] for label, records in stored.get("parts", {}).items()}
 
     def save(self) -> None:
         """Write all of it, in one step."""
         parts = {label: [_plain(r) for r in records] for label, records in self.parts.items()}
-        stored = {"code": self.code, "scale": self.scale, "seconds": self.seconds, "kinds": self.kinds}
-        stored["parts"] = parts
+        oracle = {label: [t._asdict() for t in told] for label, told in self.oracle.items()}
+        stored = {"code": self.code, "scale": self.scale, "seconds": self.seconds, "again": self.again}
+        stored |= {"oracle": oracle, "parts": parts}
         text = json.dumps(stored, default=_value, separators=(",", ":"))
         self.path.parent.mkdir(parents=True, exist_ok=True)
         part = self.path.with_suffix(".part")

@@ -210,24 +210,32 @@ def fog_closed_loop_ramp(folder: Path) -> list[str]:
     period = next((p for p in code["parameters"] if p["name"] == "period"), None) if code else None
     if period:
         said += f" Period of the codes' error: {period['value']:.5g}."
-    codes = gyromodel.GyroModel(tuple(e for e in extended.effects if e.label in ("bias", "bias_readout_code")))
-    splits = [_split(whole, codes, fitted, judged) for fitted in (40, 60, 80, 100) for judged in (40, 80)]
+    splits = [row for fitted in (40, 60, 80, 100) for row in _split(whole, folder / f"first_{fitted}", fitted)]
     return [
         said, "", *table(["model, fitted on the first 100 s", "std on the 80 s after, nrad/s"], rows), "",
-        "The level of the record changes with time; the codes' error fitted anew on parts of it:", "",
-        *table(["fitted on the first", "judged on the", "bias alone, nrad/s", "and the codes' error"], splits),
+        "The level of the record changes with time; `diagnose` of parts of it, and what follows each:", "",
+        *table(["diagnosed: the first", "judged: the", "bias alone, nrad/s", "codes' error", "all named"], splits),
     ]  # fmt: skip
 
 
-def _split(whole: gyromodel.Campaign, codes: gyromodel.GyroModel, fitted: int, judged: int) -> list[str]:
-    """What a bias, and a bias with the codes' error, leave of `judged` seconds after the first `fitted`, nrad/s."""
+def _split(whole: gyromodel.Campaign, folder: Path, fitted: int) -> list[list[str]]:
+    """What a bias, the codes' error and all that `diagnose` names on the first seconds leave of those after, nrad/s."""
+    folder.mkdir()
     time = whole.columns["time"] - whole.columns["time"][0]
-    first, later = whole.select(time < fitted), whole.select((time >= fitted) & (time < fitted + judged))
-    after = read_signals(later)
-    rest = after.signals["output"] - gyromodel.fit(first, codes).model.predict(after.signals)
-    output = after.signals["output"]
-    std = (f"{1e9 * np.asarray(values)[: after.rows][after.present].std():.0f}" for values in (output, rest))
-    return [f"{fitted} s", f"{judged} s after", *std]
+    gyromodel.write_campaign(whole.select(time < fitted), folder / "first.csv")
+    (folder / "simulation.yaml").write_text("gyro: fog\neffects:\n  - effect: bias\n")
+    result, _, refusal = command("diagnose", folder / "first.csv", "--model", folder / "simulation.yaml", "-o", folder)
+    if not result:
+        raise SystemExit(refusal)
+    named, rows = read_model(folder / "model.yaml"), []
+    codes = gyromodel.GyroModel(tuple(e for e in named.effects if e.label in ("bias", "bias_readout_code")))
+    for judged in (40, 80):
+        after = read_signals(whole.select((time >= fitted) & (time < fitted + judged)))
+        output = after.signals["output"]
+        left = (output, *(output - model.predict(after.signals) for model in (codes, named)))
+        std = (f"{1e9 * np.asarray(values)[: after.rows][after.present].std():.0f}" for values in left)
+        rows.append([f"{fitted} s", f"{judged} s after", *std])
+    return rows
 
 
 def _with_double_mains(rest: np.ndarray, time: np.ndarray, first: np.ndarray) -> np.ndarray:

@@ -5,8 +5,9 @@
 writes a table with 95 % Clopper-Pearson intervals, a confusion matrix, power curves and p-values to
 benchmarks/results/discovery.md, discovery_confusion.png and discovery_power.png. --scale 0.25 takes a quarter of the
 campaigns. What was run is kept in benchmarks/results/discovery/, by seed: a study that was stopped goes on where it
-was. The page is made of all finished seeds there, of this engine if it has any; they differ by a hundred or more, as
-parts of one seed differ by less. --page makes it again without running anything.
+was; --again 200 counts how many of 200 answers are still today's engine's. The page is made of all finished seeds
+there, of this engine if it has any; they differ by a hundred or more, as parts of one seed differ by less. --page
+makes it again without running anything.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from benchmarks._discovery_page import SIZES, TIMED_DRAWS, write_page
 from benchmarks._kept import Kept, code
 from tests.truth import study
@@ -35,6 +38,8 @@ NULLS, EFFECTS, CURVE, OUTER, UNKNOWNS, PAIRS = 400, 600, 200, 150, 300, 400
 INSEPARABLE, CALIBRATED, MUTATED = 120, 200, 60
 # However small the part, so many of what is counted in few campaigns.
 FEWEST = 24
+# Parts that an oracle is asked about which knows how levels of noise are drawn.
+ORACLE = ("nothing", "nothing, moving", "inseparable", "unknown 10")
 DRAWS = 200  # of a calibration whose p-values are looked at
 # Diagnoses timed: campaigns of about 1000 rows.
 TIMED = ("static_cycle", "rate_temperature", "rate_steps", "tumble")
@@ -48,6 +53,7 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--output", type=Path, default=RESULTS / "discovery.md")
     parser.add_argument("--kept", type=Path, default=RESULTS / "discovery", help="folder of what was run")
     parser.add_argument("--page", action="store_true", help="make the page of what is there")
+    parser.add_argument("--again", type=int, default=0, help="diagnose so many of the kept campaigns again, and count")
     parser.add_argument(
         "--go-on", action="store_true", help="go on also with another engine, which the page then names"
     )
@@ -62,21 +68,25 @@ def _seconds(case: study.Case) -> tuple[int, float]:
     return len(built.truth.noise), time.process_time() - start
 
 
-def _timed(seed: int, designs: Sequence[str] = TIMED) -> list[tuple[str, int, float]]:
-    """Row 18: design, rows and processor seconds, in one process of its own with nothing drawn before."""
-    cases = [study.Case(seed + i, name, "flicker", None) for i, name in enumerate(designs)]
+def _timed(seed: int, designs: Sequence[str] = TIMED) -> list[tuple[str, int, float, float]]:
+    """Row 18: design, rows and processor seconds, nothing drawn before; by a first process, and by one that it spares.
+
+    The second finds what the first has compiled.
+    """
     places = ("XDG_CACHE_HOME", "JAX_COMPILATION_CACHE_DIR")
-    kept = {name: os.environ[name] for name in places if name in os.environ}
+    kept, found = {name: os.environ[name] for name in places if name in os.environ}, []
     with tempfile.TemporaryDirectory() as cache:
-        os.environ |= dict.fromkeys(places, cache)  # read by the new process
+        os.environ |= dict.fromkeys(places, cache)  # read by the new processes
         try:
-            with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-                found = list(pool.map(_seconds, cases))
+            for first in (seed, seed + len(designs)):
+                cases = [study.Case(first + i, name, "flicker", None) for i, name in enumerate(designs)]
+                with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+                    found.append(list(pool.map(_seconds, cases)))
         finally:
             for name in places:
                 os.environ.pop(name)
             os.environ |= kept
-    return [(name, *one) for name, one in zip(designs, found, strict=True)]
+    return [(name, rows, one, two) for name, (rows, one), (_, two) in zip(designs, *found, strict=True)]
 
 
 def _plan(seed: int, scale: float, controls: Sequence[str]) -> Iterator[tuple[str, list[study.Case], dict[str, Any]]]:
@@ -121,6 +131,24 @@ def _plan(seed: int, scale: float, controls: Sequence[str]) -> Iterator[tuple[st
     yield "forced_no_nesting", more, {"mutant": "forced_no_nesting", "gain": True}
 
 
+def _again(kept: Kept, count: int, workers: int) -> tuple[str, int, int]:
+    """Today's engine, how many campaigns it diagnoses again, and how many of these have another answer.
+
+    Of those that were diagnosed without a gain, which prunes.
+    """
+    plain = ("nothing", "effects", "unknown", "pairs", "inseparable", "drifts")
+    labels = [label for label in kept.parts if label.startswith(plain) and label != "effects 3, white"]
+    before = [r for label in labels for r in kept.parts[label] if r.answer]
+    before = [before[i] for i in np.random.default_rng(0).permutation(len(before))[:count]]
+
+    def said(record: study.Record) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
+        assert record.answer
+        return record.answer.verdict, tuple(sorted(record.answer.causes)), record.answer.driver
+
+    after = study.run_cases([r.case for r in before], workers)
+    return code(), len(before), sum(said(a) != said(b) for a, b in zip(before, after, strict=True))
+
+
 def main(argv: list[str] | None = None) -> None:
     args = _arguments(argv)
     start, controls = time.time(), study.CONTROLS if find_spec("sklearn") else ()
@@ -132,20 +160,24 @@ def main(argv: list[str] | None = None) -> None:
         kept = Kept(args.kept / f"seed_{args.seed}.json.gz")
         before = kept.code.split(" and ") if kept.parts and args.go_on else []
         made = " and ".join(dict.fromkeys([*before, code()])), args.scale
-        if kept.parts and (made[1] != kept.scale or (made[0] != kept.code and not args.go_on)):
+        plan = [part for part in _plan(args.seed, args.scale, controls) if part[0] not in kept.parts]
+        if plan and kept.parts and (made[1] != kept.scale or (made[0] != kept.code and not args.go_on)):
             raise SystemExit(
                 f"{kept.path} was made by code {kept.code} at scale {kept.scale:g}, and this is {made[0]} at "
                 f"{made[1]:g}: take another --seed, or remove it"
             )
-        kept.code, kept.scale = made
-        for label, cases, options in _plan(args.seed, args.scale, controls):
-            if label not in kept.parts:
-                kept.parts[label] = study.run_cases(cases, args.workers, **options)
-                kept.save()
-                print(f"{label}: {len(cases)} campaigns, {time.time() - start:.0f} s", file=sys.stderr, flush=True)
-        if not kept.kinds:
-            nulls = kept.parts["nothing"] + kept.parts["nothing, moving"]
-            kept.kinds = study.in_processes(study.oracle_kind, [r.case for r in nulls], args.workers)
+        for label, cases, options in plan:
+            kept.code, kept.scale = made
+            kept.parts[label] = study.run_cases(cases, args.workers, **options)
+            kept.save()
+            print(f"{label}: {len(cases)} campaigns, {time.time() - start:.0f} s", file=sys.stderr, flush=True)
+        for label in (label for label in ORACLE if label not in kept.oracle):
+            cases = [r.case for r in kept.parts[label]]
+            kept.oracle[label] = study.in_processes(study.oracle_told, cases, args.workers)
+            kept.save()
+            print(f"{label}, the oracle: {time.time() - start:.0f} s", file=sys.stderr, flush=True)
+        if args.again:
+            kept.again = _again(kept, args.again, args.workers)
             kept.save()
         if not kept.seconds:
             kept.seconds = _timed(args.seed + 70)

@@ -11,7 +11,7 @@ from scipy.integrate import quad
 from scipy.stats import binom, binomtest, kstest, kurtosis, norm
 from scipy.stats import t as student_t
 
-from tests.truth import contest, levels, noise, study
+from tests.truth import contest, laws, levels, noise, study
 from tests.truth.campaigns import HOMES, MOTION, RUNS, TESTABLE, UNCATALOGUED, A, B, C, hide
 from tests.truth.designs import DESIGNS, RAMP_CODES
 from tests.truth.effects import EFFECTS, UNKNOWN, coil_temperature_rate, draw_shape, error
@@ -385,16 +385,50 @@ def test_simulators_share_no_code_with_the_package():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+def some_rows(design, rows: int):
+    """The first rows of a design."""
+    return replace(design, index=design.index[:rows], true={k: v[:rows] for k, v in design.true.items()})
+
+
 def test_oracle_of_noise_is_right_as_often_as_it_says(rng):
     rows, right, sure = 250, [], []
     for kind in noise.FAMILY * 10:
-        design = DESIGNS[C](rng)
-        design = replace(design, index=design.index[:rows], true={k: v[:rows] for k, v in design.true.items()})
+        design = some_rows(DESIGNS[C](rng), rows)
         data = 1e-3 + noise.draw(kind, design, rng).sample(design, rng)
-        shares = noise.kind_shares(data, design, np.ones((rows, 1)))
+        shares = laws.tell(data, design, np.ones((rows, 1)), {}).kinds
         assert sum(shares.values()) == pytest.approx(1.0)
         right.append(kind == max(shares, key=shares.__getitem__))
         sure.append(max(shares.values()))
     scatter = np.sqrt(sum(p * (1 - p) for p in sure))
     assert abs(sum(right) - sum(sure)) < norm.isf(RARE / 2) * scatter
     assert np.mean(right) > 0.4  # a guess: 0.25
+
+
+def test_oracle_of_effects_is_right_as_often_as_it_says(rng):
+    """A drift or a step or neither, each as likely, of sizes from the oracle's prior, in noise of any kind."""
+    rows, right, sure = 250, 0, []
+    names = ("", "bias_drift", "bias_step")
+    for kind in noise.FAMILY * 15:
+        design, name = some_rows(DESIGNS[C](rng), rows), str(rng.choice(names))
+        law = noise.draw(kind, design, rng)
+        data = 1e-3 + law.sample(design, rng)
+        signals = {n: s for n, s in contest.everything(design, None).items() if n in names}
+        if name:
+            shape = signals[name][:, rng.integers(signals[name].shape[1]), 0]
+            knower = oracle(design, law, ("bias",))
+            data = data + rng.standard_normal() * np.sqrt(rng.choice(laws.SIZES)) * shape / knower.norm(shape)
+        told = laws.tell(data, design, np.ones((rows, 1)), signals).evidence
+        odds = np.exp([0.0, *(told[n] for n in names[1:])])
+        shares = odds / odds.sum()
+        right += name == names[int(np.argmax(shares))]
+        sure.append(float(shares.max()))
+    scatter = np.sqrt(sum(p * (1 - p) for p in sure))
+    assert abs(right - sum(sure)) < norm.isf(RARE / 2) * scatter
+    assert right > 30  # a guess: 20 of 60
+
+
+def test_oracle_says_names_that_hold_95_percent():
+    of = laws.Told({}, {"a": 5.0, "b": 4.0, "c": 1.0})
+    assert of.said == ("a", "b")
+    assert laws.Told({}, {"a": 9.0, "b": 4.0}).said == ("a",)
+    assert laws.Told({}, {"a": 2.9}).said == ()

@@ -71,19 +71,37 @@ def _signals(name: str, design: Design) -> Array:
     return np.stack([error(name, design, size, shape) for shape in shapes], axis=1)[:, :, None]
 
 
+def everything(design: Design, effect: str | None) -> Library:
+    """As `library`, of every effect whose columns the design has, whether or not the study hides it there."""
+    signals = {}
+    for name in sorted({e for effects in TESTABLE.values() for e in effects} - {*baseline(design, effect)}):
+        try:
+            with np.errstate(all="ignore"), catch_warnings(action="ignore"):
+                block = _signals(name, design)
+        except (KeyError, AssertionError):  # it needs what the design lacks
+            continue
+        if np.isfinite(block).all() and np.abs(block).max() > 0:
+            signals[name] = block
+    return signals
+
+
 def reduced(judge: Oracle, signals: Library) -> Library:
     """Whitened, projected and, within each shape, orthonormalised signals."""
     result = {}
     for name, block in signals.items():
-        n, m, q = block.shape
-        flat = judge.reduce(block.reshape(n, m * q) / np.abs(block).max())
-        unit = flat.reshape(n, m, q)
-        for j in range(q):
-            for i in range(j):
-                unit[:, :, j] -= np.sum(unit[:, :, i] * unit[:, :, j], axis=0) * unit[:, :, i]
-            unit[:, :, j] /= np.linalg.norm(unit[:, :, j], axis=0)
-        result[name] = unit
+        flat = judge.reduce(block.reshape(len(block), -1) / np.abs(block).max())
+        result[name] = orthonormal(flat.reshape(block.shape))
     return result
+
+
+def orthonormal(block: Array) -> Array:
+    """The columns of each shape as orthonormal ones."""
+    unit = block.copy()
+    for j in range(unit.shape[2]):
+        for i in range(j):
+            unit[:, :, j] -= np.sum(unit[:, :, i] * unit[:, :, j], axis=0) * unit[:, :, i]
+        unit[:, :, j] /= np.maximum(np.linalg.norm(unit[:, :, j], axis=0), 1e-300)
+    return unit
 
 
 def energies(unit: Library, residual: Array) -> dict[str, Array]:

@@ -8,12 +8,11 @@ lengths before the first sample, as in a gyro that was already on.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
 from scipy.signal import lfilter, oaconvolve
-from scipy.special import logsumexp
 
 from .designs import Design
 
@@ -181,34 +180,25 @@ def draw(kind: str, design: Design, rng: np.random.Generator) -> Noise:
     raise ValueError(f"no noise kind {kind!r}")
 
 
-def kind_shares(data: Array, design: Design, fixed: Array) -> dict[str, float]:
-    """Share of the posterior of each kind of the family: what an oracle can tell that knows how `draw` draws colour.
+def family(design: Design, points: int = 6) -> Iterator[tuple[str, float, Array]]:
+    """Kinds of noise, weights and covariances, the white of unit N, as `draw` draws them: kinds are as likely.
 
-    All kinds are as likely, and their crossings have the law of `draw`; the white level (any, log-uniform) and the
-    coefficients of the columns of `fixed` are integrated out in closed form.
+    Gauss-Legendre nodes stand for the levels of a kind.
     """
-    rows, step, points = design.index, design.step, (np.arange(10) + 0.5) / 10
+    nodes, weights = np.polynomial.legendre.leggauss(points)
+    nodes, weights = (nodes + 1) / 2, weights / 2
+    rows, step = design.index, design.step
     white = Noise("white", 1.0).covariance(design)
-    flickers = _flicker_level(1.0, step, FLICKER[0] + np.ptp(FLICKER) * points)
-    walks = _walk_level(1.0, step, WALK[0] + np.ptp(WALK) * points)
-    flicker = [driving_variance(B, 1.0, step) * _fractional_covariance(rows, 1.0) for B in flickers]
-    walk = [driving_variance(K, 2.0, step) * _fractional_covariance(rows, 2.0) for K in walks]
-    covariances = {
-        "white": [white],
-        "flicker": (white + f for f in flicker),
-        "random_walk": (white + w for w in walk),
-        "flicker_and_walk": (white + f + w for f in flicker for w in walk),
-    }
-    each = {kind: [_evidence(data, V, fixed) for V in all_of] for kind, all_of in covariances.items()}
-    scores = {kind: float(logsumexp(values) - np.log(len(values))) for kind, values in each.items()}
-    total = logsumexp(list(scores.values()))
-    return {kind: float(np.exp(score - total)) for kind, score in scores.items()}
-
-
-def _evidence(data: Array, covariance: Array, fixed: Array) -> float:
-    """Ln of the likelihood of a covariance of unknown scale, the coefficients of `fixed` at any value."""
-    L = cholesky(covariance, lower=True)
-    whitened = solve_triangular(L, np.column_stack([fixed, data]), lower=True)
-    R = np.linalg.qr(whitened, mode="r")
-    freedom = len(data) - fixed.shape[1]
-    return float(-np.log(np.diag(L)).sum() - np.log(np.abs(np.diag(R)[:-1])).sum() - freedom * np.log(abs(R[-1, -1])))
+    flicker, walk = (_fractional_covariance(rows, alpha) for alpha in (1.0, 2.0))
+    levels = [_flicker_level(1.0, step, FLICKER[0] + np.ptp(FLICKER) * node) for node in nodes]
+    flickers = [driving_variance(B, 1.0, step) * flicker for B in levels]
+    levels = [_walk_level(1.0, step, WALK[0] + np.ptp(WALK) * node) for node in nodes]
+    walks = [driving_variance(K, 2.0, step) * walk for K in levels]
+    yield "white", 1.0, white
+    for weight, of_flicker in zip(weights, flickers, strict=True):
+        yield "flicker", weight, white + of_flicker
+    for weight, of_walk in zip(weights, walks, strict=True):
+        yield "random_walk", weight, white + of_walk
+    for first, of_flicker in zip(weights, flickers, strict=True):
+        for second, of_walk in zip(weights, walks, strict=True):
+            yield "flicker_and_walk", first * second, white + of_flicker + of_walk

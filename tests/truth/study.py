@@ -18,11 +18,12 @@ from . import contest
 from .campaigns import HOMES, LOOP, MOTION, RUNS, TESTABLE, UNCATALOGUED, A, B, C, Truth, hide, known
 from .designs import DESIGNS, Design
 from .effects import error
+from .laws import Told, tell
 from .mde import Oracle, baseline, oracle, parts
 from .motion import MOTION_EFFECTS
 from .motion_designs import MOTION_DESIGNS
 from .mutants import mutated
-from .noise import FAMILY, Noise, draw, kind_shares
+from .noise import FAMILY, Noise, draw
 from .verdicts import Answer, Score, judge
 
 Array = np.ndarray
@@ -140,14 +141,17 @@ def run_engine(
     )
 
 
-def oracle_kind(case: Case) -> tuple[str, str]:
-    """The noise of a case with nothing hidden, and what an oracle takes it for that knows how levels are drawn."""
+def oracle_told(case: Case) -> Told:
+    """What an oracle tells of a campaign that knows how levels are drawn, and the shape of what no catalogue lists."""
     built = build(case)
-    design = built.design
+    design, truth = built.design, built.truth
     data = np.deg2rad(built.columns["output"]) - design.true["rate"]
-    fixed = np.column_stack([error(name, design, 1.0, {}) for name in built.truth.baseline])
-    shares = kind_shares(data, design, fixed)
-    return case.noise, max(shares, key=shares.__getitem__)
+    none = np.zeros((len(data), 0))
+    fixed = np.column_stack([none, *(error(name, design, 1.0, {}) for name in truth.baseline)])
+    signals = contest.everything(design, case.effect)
+    if case.effect and not known(case.effect):
+        signals[case.effect] = truth.error[:, None, None]
+    return tell(data, design, fixed, signals)
 
 
 def settled(built: Built, campaign: Any, model: Any, asked: str | None) -> tuple[str, ...] | None:
