@@ -303,8 +303,8 @@ def _bounds(parts: dict[str, list[study.Record]], told: dict[str, list[Told]]) -
         counted["2", f"something said, {noise.replace('_', ' ')}"] = [
             bool(t.said) for r, t in nulls if r.case.noise == noise
         ]
-    counted["8", "told by its own shape, no other name beside, 10×"] = [
-        t.said == (r.case.effect,) for r, t in zip(parts["unknown 10"], told["unknown 10"], strict=False)
+    counted["8", "a function of the column ahead of all names, 10×, columns that are measured or their rates"] = [
+        t.evidence["smooth"] == max(t.evidence.values()) for t in told["unknown 10"] if "smooth" in t.evidence
     ]
     counted["12", "ambiguous with the truth"] = [
         len(t.said) > 1 and r.case.effect in t.said

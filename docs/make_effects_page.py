@@ -77,9 +77,15 @@ def _meaning(parameter: ParameterDeclaration) -> str:
 
 
 def _noise() -> str:
-    rows = [[f"`{kind.id}`", kind.unit, kind.density, kind.allan_variance, kind.meaning] for kind in NOISE.values()]
-    table = _table(["noise", "unit", "rate PSD, two-sided", "Allan variance", "meaning"], rows)
-    return f"## Noise\n\n{table}\nKinds that are not stated in model files are told of by `diagnose`.\n"
+    rows = [
+        [f"`{k.id}`", k.unit, "–" if k.typical is None else f"{k.typical:g}", k.density, k.allan_variance, k.meaning]
+        for k in NOISE.values()
+    ]
+    table = _table(["noise", "unit", "typical", "rate PSD, two-sided", "Allan variance", "meaning"], rows)
+    told = _table(
+        ["noise", "cause", "test that separates it"], [[f"`{k.id}`", k.cause, k.test] for k in NOISE.values()]
+    )
+    return f"## Noise\n\n{table}\n{told}\nKinds that are not stated in model files are told of by `diagnose`.\n"
 
 
 def _table(head: list[str], rows: list[list[str]]) -> str:

@@ -43,7 +43,8 @@ def print_catalogue(found: list[dict[str, Any]]) -> None:
 def print_entry(entry: dict[str, Any]) -> None:
     """One entry, in full."""
     if entry["id"] in NOISE:
-        print("\n".join(f"{name.replace('_', ' '):<15}{value}" for name, value in entry.items()))
+        shown = {name: "–" if value is None else value for name, value in entry.items()}
+        print("\n".join(f"{name.replace('_', ' '):<15}{value}" for name, value in shown.items()))
         return
     print("\n".join(filter(None, [entry["id"], entry["equation"], entry["details"]])))
     needs = ", ".join(entry["needs"]) or "no column"

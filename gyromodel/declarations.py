@@ -47,37 +47,74 @@ class Declaration:
 
 @dataclass(frozen=True)
 class NoiseKind:
-    """A kind of noise by its public id: unit, two-sided power spectral density of the rate, Allan variance, meaning."""
+    """A kind of noise by its public id.
+
+    Unit and typical size (none of what has no size), two-sided power spectral density of the rate, Allan variance,
+    meaning, physical cause, and the test that tells it from what looks like it.
+    """
 
     id: str
     unit: str
+    typical: float | None
     density: str
     allan_variance: str
     meaning: str
+    cause: str
+    test: str
 
 
 NOISE = {
     kind.id: kind
     for kind in (
-        NoiseKind("noise_white", "deg/sqrt(h)", "N²", "N²/τ", "angle random walk"),
-        NoiseKind("noise_flicker", "deg/h", "B²/(2πf)", "(2 ln2/π) B²", "bias instability"),
-        NoiseKind("noise_random_walk", "deg/h/sqrt(h)", "K²/(2πf)²", "K² τ/3", "rate random walk"),
         NoiseKind(
-            "noise_markov",
-            "deg/h/sqrt(h)",
-            "(q T)²/(1 + (2πf T)²)",
-            "peak (0.437 q)² T at 1.89 T",
+            "noise_white", "deg/sqrt(h)", 0.01, "N²", "N²/τ", "angle random walk",
+            "Shot noise of the light, and noise of the detector and its electronics.",
+            "Log at rest: the Allan deviation falls as 1/√τ; that of quantisation falls as 1/τ.",
+        ),
+        NoiseKind(
+            "noise_flicker", "deg/h", 0.01, "B²/(2πf)", "(2 ln2/π) B²", "bias instability",
+            "Electronics and light source fluctuate at all time scales alike.",
+            "A longer log at rest: the Allan deviation stays level; that of a random walk rises.",
+        ),
+        NoiseKind(
+            "noise_random_walk", "deg/h/sqrt(h)", 0.01, "K²/(2πf)²", "K² τ/3", "rate random walk",
+            "Small lasting changes inside add up.",
+            "Repeat the run: a drift, a warm-up or a step at power-on comes back, a random walk does not.",
+        ),
+        NoiseKind(
+            "noise_markov", "deg/h/sqrt(h)", 0.1, "(q T)²/(1 + (2πf T)²)", "peak (0.437 q)² T at 1.89 T",
             "a first-order Markov process; stated with its time_constant T, and not beside noise_flicker",
+            "Something that is drawn back, as a controlled temperature, fluctuates and forgets in a time T.",
+            "A log of many T: the Allan deviation peaks and falls again; that of a random walk goes on rising.",
         ),
-        NoiseKind("noise_quantisation", "arcsec", "(2πf)² Q² τ0", "3 Q²/τ²", "white noise of the angle; not stated"),
-        NoiseKind("noise_telegraph", "deg/h", "–", "–", "hops of the bias between two levels; not stated"),
-        NoiseKind("noise_heteroscedastic", "1", "–", "–", "a level that follows rate, temperature or time; not stated"),
         NoiseKind(
-            "noise_rate_ramp", "deg/h/h", "–", "R² τ²/2", "a trend of a gyro at rest, as `allan` tells it; not stated"
+            "noise_quantisation", "arcsec", 1.0, "(2πf)² Q² τ0", "3 Q²/τ²", "white noise of the angle; not stated",
+            "The angle is counted in whole steps.",
+            "Read the angle in finer steps: what falls with them is quantisation.",
         ),
-        NoiseKind("outliers", "–", "–", "–", "gross errors in single samples, test points or dwells; not stated"),
+        NoiseKind(
+            "noise_telegraph", "deg/h", 0.1, "–", "–", "hops of the bias between two levels; not stated",
+            "A laser hops between two modes, or a component has popcorn noise.",
+            "Log the laser current beside: hops of modes come with it; what switches nearby keeps a regular pace.",
+        ),
+        NoiseKind(
+            "noise_heteroscedastic", "1", 2.0, "–", "–", "a level that follows rate, temperature or time; not stated",
+            "Its source grows with the rate (a table's motion) or with the temperature (less light, more current).",
+            "Log at rest at several temperatures, and at several rates at one temperature.",
+        ),
+        NoiseKind(
+            "noise_rate_ramp", "deg/h/h", 0.01, "–", "R² τ²/2",
+            "a trend of a gyro at rest, as `allan` tells it; `diagnose` names it bias_drift; not stated",
+            "Ageing, or a temperature that goes one way.",
+            "Repeat the run from power-on: a trend comes back, a random walk does not.",
+        ),
+        NoiseKind(
+            "outliers", "–", None, "–", "–", "gross errors in single samples, test points or dwells; not stated",
+            "A knock, a lost or late sample, or a test point that was set wrong.",
+            "Repeat the point: a curve comes back, a gross error does not.",
+        ),
     )
-}
+}  # fmt: skip
 
 
 def declarations() -> dict[str, Declaration]:

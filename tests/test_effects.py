@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
+from gyromodel.declarations import NOISE, NoiseKind
 from gyromodel.effects import CATALOGUE, Effect
 from gyromodel.effects.drivers import Bias
 from gyromodel.effects.scale import ScaleAsymmetry, ScaleFactor, ScaleNonlinearity, ScaleSpline
@@ -151,6 +152,16 @@ def test_declarations_are_complete(label: str):
         parse(declared.unit)
         assert convertible(declared.unit, internal_unit(declared.unit)), name
         assert factor(declared.unit, internal_unit(declared.unit)) > 0
+
+
+@pytest.mark.parametrize("kind", NOISE.values(), ids=NOISE)
+def test_kinds_of_noise_have_a_size_a_cause_and_a_test(kind: NoiseKind):
+    for sentence in (kind.cause, kind.test):
+        assert re.fullmatch(r"[A-Z].{15,}\.", sentence)
+    if kind.typical is not None:
+        assert kind.typical > 0
+        parse(kind.unit)
+    assert (kind.typical is None) == (kind.id == "outliers")
 
 
 # Effect, its parameters and settings as written, signals, and the contribution expected: deg/h for the rate, ppm for

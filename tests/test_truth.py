@@ -432,3 +432,9 @@ def test_oracle_says_names_that_hold_95_percent():
     assert of.said == ("a", "b")
     assert laws.Told({}, {"a": 9.0, "b": 4.0}).said == ("a",)
     assert laws.Told({}, {"a": 2.9}).said == ()
+
+
+@pytest.mark.parametrize(("effect", "first"), [("temperature_ripple", "smooth"), ("bias_step", "bias_step")])
+def test_oracle_tells_what_is_unlisted_by_its_column(effect: str, first: str):
+    evidence = study.oracle_told(study.Case(1, B, "white", effect, 10.0)).evidence
+    assert max(evidence, key=evidence.__getitem__) == first

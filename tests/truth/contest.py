@@ -85,6 +85,22 @@ def everything(design: Design, effect: str | None) -> Library:
     return signals
 
 
+def smooths(design: Design, driver: tuple[str, ...]) -> Library:
+    """Functions of one column or of two, by length: Gaussian kernels; none where no column is the driver itself."""
+    names = ["temperature_rate" if column == "d(temperature)/dt" else column for column in driver]
+    if not all(name in design.true for name in names):
+        return {}
+    found = {}
+    for length in (0.25, 0.6) if len(names) > 1 else (0.08, 0.2, 0.5):
+        block = np.ones((len(design.index), 1))
+        for name in names:
+            x = (design.true[name] - design.true[name].min()) / np.ptp(design.true[name])
+            each = np.exp(-0.5 * ((x[:, None] - np.arange(-length, 1 + 2 * length, length)) / length) ** 2)
+            block = (block[:, :, None] * each[:, None, :]).reshape(len(block), -1)
+        found[f"smooth {length:g}"] = block[:, None]
+    return found
+
+
 def reduced(judge: Oracle, signals: Library) -> Library:
     """Whitened, projected and, within each shape, orthonormalised signals."""
     result = {}

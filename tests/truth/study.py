@@ -12,6 +12,7 @@ from multiprocessing import get_context
 from typing import Any, TypeVar
 
 import numpy as np
+from scipy.special import logsumexp
 from scipy.stats import norm
 
 from . import contest
@@ -142,16 +143,22 @@ def run_engine(
 
 
 def oracle_told(case: Case) -> Told:
-    """What an oracle tells of a campaign that knows how levels are drawn, and the shape of what no catalogue lists."""
+    """What an oracle tells of a campaign that knows how levels are drawn, and what column the unlisted follows.
+
+    Of that the function is smooth at some length, as far as anybody knows: its evidence is that of "smooth".
+    """
     built = build(case)
     design, truth = built.design, built.truth
     data = np.deg2rad(built.columns["output"]) - design.true["rate"]
     none = np.zeros((len(data), 0))
     fixed = np.column_stack([none, *(error(name, design, 1.0, {}) for name in truth.baseline)])
-    signals = contest.everything(design, case.effect)
-    if case.effect and not known(case.effect):
-        signals[case.effect] = truth.error[:, None, None]
-    return tell(data, design, fixed, signals)
+    smooths = contest.smooths(design, truth.driver) if truth.driver else {}
+    told = tell(data, design, fixed, contest.everything(design, case.effect) | smooths)
+    if not smooths:
+        return told
+    names = {name: value for name, value in told.evidence.items() if name not in smooths}
+    together = float(logsumexp([told.evidence[name] for name in smooths]) - np.log(len(smooths)))
+    return Told(told.kinds, names | {"smooth": together})
 
 
 def settled(built: Built, campaign: Any, model: Any, asked: str | None) -> tuple[str, ...] | None:
