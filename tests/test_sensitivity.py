@@ -130,7 +130,6 @@ def averaged(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(room, "LONGEST", 20_000)
 
 
-@pytest.mark.usefixtures("averaged")
 def test_steps_of_the_output_are_noise_of_a_mission():
     """A step much finer than the noise adds a twelfth of its square."""
     white, step = WHITE / np.sqrt(STEP), 0.8 * WHITE / np.sqrt(STEP)
@@ -140,6 +139,7 @@ def test_steps_of_the_output_are_noise_of_a_mission():
     assert found.results[0].budget.noise["noise_white"] * DEG_H == pytest.approx(read, rel=1e-3)
 
 
+@pytest.mark.usefixtures("averaged")
 def test_a_long_mission_has_the_noise_and_the_errors_of_its_samples():
     """The same ramp at a hundred times the rate, which is averaged: a rate's noise is that of one sample."""
     rows = 100 * ROWS + 100
