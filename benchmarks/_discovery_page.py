@@ -295,21 +295,26 @@ def _beside_names(records: list[study.Record]) -> list[str]:
     return [f"| 5 | {k} | – | – | {100 * n / max(m, 1):.1f} % | {m} | – | |" for k, (n, m) in counted.items()]
 
 
+def asked(label: str, records: list[study.Record]) -> list[study.Record]:
+    """The campaigns of a part that the oracle is asked about: of unknown effects those that were not flagged."""
+    return [r for r in records if label != "unknown 10" or not (r.score and r.score.called_unknown)]
+
+
 def _bounds(parts: dict[str, list[study.Record]], told: dict[str, list[Told]]) -> list[str]:
     """Rows 1, 2, 8, 12 and 14 of an oracle that knows how levels are drawn, as sure as the engine, on the same data."""
-    nulls = [pair for k in ("nothing", "nothing, moving") for pair in zip(parts[k], told[k], strict=False)]
+    both = {label: list(zip(asked(label, parts[label]), told[label], strict=True)) for label in told if told[label]}
+    nulls = both.get("nothing", []) + both.get("nothing, moving", [])
     counted = {("1", "something said, nothing hidden, noise of the family"): [bool(t.said) for _, t in nulls]}
     for noise in FAMILY:
-        counted["2", f"something said, {noise.replace('_', ' ')}"] = [
-            bool(t.said) for r, t in nulls if r.case.noise == noise
-        ]
-    counted["8", "a function of the column ahead of all names, 10×, columns that are measured or their rates"] = [
-        t.evidence["smooth"] == max(t.evidence.values()) for t in told["unknown 10"] if "smooth" in t.evidence
-    ]
-    counted["12", "ambiguous with the truth"] = [
-        len(t.said) > 1 and r.case.effect in t.said
-        for r, t in zip(parts["inseparable"], told["inseparable"], strict=False)
-    ]
+        said = [bool(t.said) for r, t in nulls if r.case.noise == noise]
+        counted["2", f"something said, {noise.replace('_', ' ')}"] = said
+    if "unknown 10" in both:
+        # The others are taken for right.
+        flagged = [True] * (len(parts["unknown 10"]) - len(both["unknown 10"]))
+        flagged += [t.evidence["smooth"] == max(t.evidence.values()) for _, t in both["unknown 10"]]
+        counted["8", "flagged at most, 10×, told the column but not its function"] = flagged
+    inseparable = [len(t.said) > 1 and r.case.effect in t.said for r, t in both.get("inseparable", [])]
+    counted["12", "ambiguous with the truth"] = inseparable
     counted["14", "noise class"] = [max(t.kinds, key=t.kinds.__getitem__) == r.case.noise for r, t in nulls]
     return [
         f"| {row} | what bounds it: {measure}, by an oracle that knows how levels are drawn | – | – | "

@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks._discovery_page import SIZES, TIMED_DRAWS, write_page
+from benchmarks._discovery_page import SIZES, TIMED_DRAWS, asked, write_page
 from benchmarks._kept import Kept, code
 from tests.truth import study
 from tests.truth.campaigns import HOMES, MOTION, A, B, C
@@ -172,7 +172,7 @@ def main(argv: list[str] | None = None) -> None:
             kept.save()
             print(f"{label}: {len(cases)} campaigns, {time.time() - start:.0f} s", file=sys.stderr, flush=True)
         for label in (label for label in ORACLE if label not in kept.oracle):
-            cases = [r.case for r in kept.parts[label]]
+            cases = [r.case for r in asked(label, kept.parts[label])]
             kept.oracle[label] = study.in_processes(study.oracle_told, cases, args.workers)
             kept.save()
             print(f"{label}, the oracle: {time.time() - start:.0f} s", file=sys.stderr, flush=True)
