@@ -27,7 +27,7 @@ PAIRS = (
     ("rate_temperature", "bias_supply_voltage", "bias_drift"),
     ("rate_steps", "bias_temperature", "bias_drift"),
 )
-CELLS, PER_CELL, PREDICTED = 3, 100, (0.03, 0.45)
+CELLS, PER_CELL, PREDICTED = 3, 60, (0.03, 0.45)
 # What must be reached, and what is wished for.
 DEVIATION, CORRELATION = (0.05, 0.03), (0.85, 0.92)
 
