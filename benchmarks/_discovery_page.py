@@ -143,8 +143,8 @@ def write_page(output: Path, whole: list[Kept]) -> None:
 def _still(whole: list[Kept]) -> list[str]:
     """How many answers are still those of an engine that came later."""
     return [
-        f"Of {total} of them, drawn at random and diagnosed again by {engine}, {other} have another answer (verdict, "
-        "names or column)."
+        f"Of {total} of those diagnosed without a gain, drawn at random and diagnosed again by {engine}, {other} have "
+        "another answer (verdict, names or column)."
         for engine, total, other in (k.again for k in whole if k.again)
     ]
 
@@ -309,10 +309,10 @@ def _bounds(parts: dict[str, list[study.Record]], told: dict[str, list[Told]]) -
         said = [bool(t.said) for r, t in nulls if r.case.noise == noise]
         counted["2", f"something said, {noise.replace('_', ' ')}"] = said
     if "unknown 10" in both:
-        # The others are taken for right.
-        flagged = [True] * (len(parts["unknown 10"]) - len(both["unknown 10"]))
-        flagged += [t.evidence["smooth"] == max(t.evidence.values()) for _, t in both["unknown 10"]]
-        counted["8", "flagged at most, 10×, told the column but not its function"] = flagged
+        ahead = [
+            t.evidence["smooth"] == max(t.evidence.values()) for _, t in both["unknown 10"] if "smooth" in t.evidence
+        ]
+        counted["8", "flagged of those not flagged here, 10×, told the column but not its function"] = ahead
     inseparable = [len(t.said) > 1 and r.case.effect in t.said for r, t in both.get("inseparable", [])]
     counted["12", "ambiguous with the truth"] = inseparable
     counted["14", "noise class"] = [max(t.kinds, key=t.kinds.__getitem__) == r.case.noise for r, t in nulls]

@@ -71,7 +71,7 @@ def _seconds(case: study.Case) -> tuple[int, float]:
 def _timed(seed: int, designs: Sequence[str] = TIMED) -> list[tuple[str, int, float, float]]:
     """Row 18: design, rows and processor seconds, nothing drawn before; by a first process, and by one that it spares.
 
-    The second finds what the first has compiled.
+    The second finds what the first has compiled, and has other campaigns, as draws are kept too.
     """
     places = ("XDG_CACHE_HOME", "JAX_COMPILATION_CACHE_DIR")
     kept, found = {name: os.environ[name] for name in places if name in os.environ}, []
@@ -161,7 +161,7 @@ def main(argv: list[str] | None = None) -> None:
         before = kept.code.split(" and ") if kept.parts and args.go_on else []
         made = " and ".join(dict.fromkeys([*before, code()])), args.scale
         plan = [part for part in _plan(args.seed, args.scale, controls) if part[0] not in kept.parts]
-        if plan and kept.parts and (made[1] != kept.scale or (made[0] != kept.code and not args.go_on)):
+        if kept.parts and (made[1] != kept.scale or (plan and made[0] != kept.code and not args.go_on)):
             raise SystemExit(
                 f"{kept.path} was made by code {kept.code} at scale {kept.scale:g}, and this is {made[0]} at "
                 f"{made[1]:g}: take another --seed, or remove it"

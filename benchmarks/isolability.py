@@ -57,9 +57,9 @@ def summary(cells: list[study.Confusion], rng: np.random.Generator) -> list[list
     ):
         low, high = np.nanquantile(again[:, i], [0.025, 0.975])
         row = [name]
-        for level in wanted:
+        for level, short in zip(wanted, ("**missed**", "missed"), strict=True):
             met, open_ = (of[i] >= level, high >= level) if at_least else (of[i] <= level, low <= level)
-            row.append(f"{'≥' if at_least else '≤'} {level:g}: {'met' if met else 'open' if open_ else 'missed'}")
+            row.append(f"{'≥' if at_least else '≤'} {level:g}: {'met' if met else 'open' if open_ else short}")
         rows.append([*row, f"{of[i]:.3f} ({low:.3f} to {high:.3f})"])
     return rows
 

@@ -106,7 +106,7 @@ NOISE = {
             "noise_rate_ramp", "deg/h/h", 0.01, "–", "R² τ²/2",
             "a trend of a gyro at rest, as `allan` tells it; `diagnose` names it bias_drift; not stated",
             "Ageing, or a temperature that goes one way.",
-            "Repeat the run from power-on: a trend comes back, a random walk does not.",
+            "Repeat the run: a trend comes back or goes on, a random walk does neither.",
         ),
         NoiseKind(
             "outliers", "–", None, "–", "–", "gross errors in single samples, test points or dwells; not stated",

@@ -101,8 +101,10 @@ def diagnose(
     readings, given = data.readings, model
     model, reading = readings.bare(given, measured, record)
     session = laid_out(record, model, step=data.step)
-    if readings.coarse_beside(record, session.baseline) and (
-        readings.mirrors(record, session.baseline) or _quantised_angle(session.baseline)
+    if (
+        not readings.same_as(reading)
+        and readings.coarse_beside(record, session.baseline)
+        and (readings.mirrors(record, session.baseline) or _quantised_angle(session.baseline))
     ):
         readings = replace(readings, step=0.0)
     rounding = readings.beside(record, session.baseline)

@@ -230,7 +230,7 @@ def as_read(model: GyroModel, record: Record, step: float) -> GyroModel:
     if model.reading is None:
         return model
     model = model.without(model.reading.label)
-    if not model.noise or not step:
+    if "noise_white" not in model.noise or not step:
         return model
     unit = _unit(model, record, step)
     white = unit * np.sqrt(rounded_variance(float(model.noise["noise_white"]) / unit))
