@@ -309,9 +309,8 @@ def _bounds(parts: dict[str, list[study.Record]], told: dict[str, list[Told]]) -
         said = [bool(t.said) for r, t in nulls if r.case.noise == noise]
         counted["2", f"something said, {noise.replace('_', ' ')}"] = said
     if "unknown 10" in both:
-        ahead = [
-            t.evidence["smooth"] == max(t.evidence.values()) for _, t in both["unknown 10"] if "smooth" in t.evidence
-        ]
+        told_of = [t.evidence for _, t in both["unknown 10"] if "smooth" in t.evidence]
+        ahead = [evidence["smooth"] == max(evidence.values()) for evidence in told_of]
         counted["8", "flagged of those not flagged here, 10×, told the column but not its function"] = ahead
     inseparable = [len(t.said) > 1 and r.case.effect in t.said for r, t in both.get("inseparable", [])]
     counted["12", "ambiguous with the truth"] = inseparable

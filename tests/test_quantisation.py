@@ -339,6 +339,15 @@ def test_campaigns_of_different_steps_are_said_not_to_be_searched():
         gm.fit(two, gm.model_from_effects(["scale_factor", "bias", "quantisation"]))
 
 
+def test_a_short_campaign_is_read_in_the_steps_of_the_long_one():
+    """Of a few samples no grid is told, but whether they lie on that of the others."""
+    whole = levels(0.02, np.random.default_rng(8))[0]
+    both, model = [whole, whole.select(np.arange(len(whole)) < 7)], gm.model_from_effects(["scale_factor", "bias"])
+    found = gm.diagnose(both, model, hold_out=False)
+    assert "quantisation" not in found.not_testable
+    assert "quantisation" in {c.effect for c in found.causes}
+
+
 def test_a_step_that_the_data_are_not_read_in_takes_nothing_from_the_noise():
     campaign = rest(0.01 + NOISE * np.random.default_rng(10).standard_normal(400))
     model = gm.GyroModel((*gm.model_from_effects(["bias"]).effects, Quantisation(step=np.deg2rad(0.02), unit="deg/s")))

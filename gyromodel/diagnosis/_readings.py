@@ -22,11 +22,11 @@ from gyromodel.estimate import (
     widened,
     with_step_of,
 )
-from gyromodel.estimate._rounding import SAME, SMEARED, saw_tooth
+from gyromodel.estimate._rounding import SAME, SMEARED, common_step, saw_tooth
 from gyromodel.model import GyroModel
-from gyromodel.numerics.rounding import grid_step, noise_before
+from gyromodel.numerics.rounding import noise_before
 from gyromodel.signals import Record
-from gyromodel.units import factor, from_internal, internal_unit
+from gyromodel.units import from_internal
 
 # Steps that an output of its inputs' grid moves over, and the part of one by which it then errs.
 FEWEST, TRUE = 2.0, 0.05
@@ -149,12 +149,10 @@ def readings_of(campaigns: Sequence[Campaign], searched: Sequence[Campaign]) -> 
     unit = campaigns[0].units["output"]
     if any(c.metadata["kind"] != "rate" for c in campaigns):
         return Readings(untested="the output is no rate: an angle that is rounded is noise_quantisation")
-    scales = [factor(c.units["output"], internal_unit(unit)) for c in campaigns]
-    steps = [(grid_step(c.columns["output"]) or 0.0) * scale for c, scale in zip(campaigns, scales, strict=True)]
+    step, alike = common_step(campaigns)
     means = any(len(s) < len(c) for c, s in zip(campaigns, searched, strict=True))
-    alike = min(steps) >= (1.0 - SAME) * max(steps)
     scatter = max(map(_of_samples, campaigns)) if means or not alike else 0.0
-    return Readings(float(max(steps)), scatter, unit, "" if alike else "campaigns are read in different steps")
+    return Readings(step, scatter, unit, "" if alike else "campaigns are read in different steps")
 
 
 def _of_samples(campaign: Campaign) -> float:

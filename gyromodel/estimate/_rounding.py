@@ -32,6 +32,8 @@ TWO_LEVELS = 2.0
 TURNS, SETTLED = 12, 0.05
 # Steps that differ by less than this part are one.
 SAME = 0.01
+# Samples from which on an output shows its steps, and the part of a step by which fewer may lie beside them.
+ENOUGH_ROWS, NEAR_GRID = 50, 0.1
 # Least noise before rounding that is told, in steps: zero is none that could be stated.
 LEAST_NOISE = 0.01
 # Places closer than this many steps are one however little noise there is; least slope of the staircase that a
@@ -215,14 +217,31 @@ def with_step_of(model: GyroModel, campaigns: Sequence[Campaign]) -> GyroModel:
         if unit:
             check_reading(reading, unit)
         return model
-    each = [grid_step(c.columns["output"]) if "output" in c.columns else None for c in campaigns]
-    steps = [s * factor(c.units["output"], internal_unit(unit)) for s, c in zip(each, campaigns, strict=True) if s]
-    if len(steps) < len(campaigns):
+    step, alike = common_step(campaigns) if all("output" in c.columns for c in campaigns) else (0.0, True)
+    if not step:
         raise ModelError(OPEN)
-    if min(steps) < (1.0 - SAME) * max(steps):
+    if not alike:
         raise ModelError("the campaigns are read in different steps: fit them apart, or leave quantisation out")
-    internal = jnp.asarray(steps[0])
-    return model.with_effect(replace(reading, step=internal, unit=unit))
+    return model.with_effect(replace(reading, step=jnp.asarray(step), unit=unit))
+
+
+def common_step(campaigns: Sequence[Campaign]) -> tuple[float, bool]:
+    """The coarsest step of the campaigns' outputs, internal unit (zero: none), and whether it is that of all.
+
+    A few samples lie on the grid of the others, or not: what is between them is no step that they are read in.
+    """
+    many = [c for c in campaigns if len(c) >= ENOUGH_ROWS]
+    few, many = ([c for c in campaigns if len(c) < ENOUGH_ROWS], many) if many else ([], list(campaigns))
+    scales = [factor(c.units["output"], internal_unit(c.units["output"])) for c in many]
+    steps = [float((grid_step(c.columns["output"]) or 0.0) * scale) for c, scale in zip(many, scales, strict=True)]
+    step = max(steps)
+    alike = min(steps) >= (1.0 - SAME) * step
+    for campaign in few if step else []:
+        output = campaign.si("output")
+        output = output[np.isfinite(output)]
+        places = (output - output[:1]) / step
+        alike &= bool((np.abs(places - np.round(places)) < NEAR_GRID).all())
+    return step, alike
 
 
 def as_read(model: GyroModel, record: Record, step: float) -> GyroModel:
