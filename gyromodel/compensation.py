@@ -162,6 +162,7 @@ def _estimate(calibration: Calibration, record: Record) -> tuple[np.ndarray, np.
     signals = {name: values for name, values in record.signals.items() if name in names}
     output = jnp.where(record.sampling.present, record.signals["output"], jnp.nan)
     white = jnp.asarray(model.noise.get("noise_white", 0.0)) ** 2 / record.interval
+    white += 2.0 * (model.noise.get("noise_quantisation", 0.0) / record.interval) ** 2
     if model.noise:
         white += (step_of(model, record) / model.gain()) ** 2 / 12.0  # of rounding
     spread = np.zeros((len(model.slots()),) * 2) if covariance is None else covariance

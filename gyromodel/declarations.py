@@ -88,7 +88,7 @@ NOISE = {
             "A log of many T: the Allan deviation peaks and falls again; that of a random walk goes on rising.",
         ),
         NoiseKind(
-            "noise_quantisation", "arcsec", 1.0, "(2πf)² Q² τ0", "3 Q²/τ²", "white noise of the angle; not stated",
+            "noise_quantisation", "arcsec", 1.0, "(2πf)² Q² τ0", "3 Q²/τ²", "white noise of the angle",
             "The angle is counted in whole steps.",
             "Read the angle in finer steps: what falls with them is quantisation.",
         ),

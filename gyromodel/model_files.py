@@ -259,6 +259,9 @@ def _read_noise(place: Place, of: list[Domain]) -> tuple[dict[str, float], Domai
             raise entry["effect"].error(f"unknown noise {name}; known are {', '.join(known)}")
         if name in noise:
             raise entry["effect"].error(f"{name} appears twice")
+        of = [domain for domain in of if name in noise_units(domain)]
+        if not of:
+            raise entry["effect"].error(f"{name} is noise of a rate, and not of the angle of a platform's base")
         noise[name] = entry["value"].number_in(*(noise_units(domain)[name] for domain in of))
         of = [d for d in of if convertible(entry["value"].quantity()[1], noise_units(d)[name])]
         if noise[name] < 0:

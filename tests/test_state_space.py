@@ -51,7 +51,10 @@ class Case(NamedTuple):
 
 
 def covariance(noise: MarkovSum, sampling: Sampling) -> np.ndarray:
-    """Covariance of all rows: exp(−|t − s|/τ) for a decaying process, min(t, s) for a walk, zero between records."""
+    """Covariance of all rows: exp(−|t − s|/τ) for a decaying process, min(t, s) for a walk, zero between records.
+
+    Of white noise of the integral a sample is the change over its own time, the usual one where it follows on none.
+    """
     interval, restart = np.asarray(sampling.interval), np.asarray(sampling.restart)
     record = np.cumsum(restart)
     time = np.zeros(len(interval))
@@ -59,7 +62,16 @@ def covariance(noise: MarkovSum, sampling: Sampling) -> np.ndarray:
         rows = record == number
         time[rows] = np.cumsum(np.where(restart[rows], 0.0, interval[rows]))
     total = np.diag(np.asarray(sampling.white))
-    for decay, variance in zip(*(np.asarray(x) for x in noise), strict=True):
+    if noise.integral is not None:
+        rows, usual = np.arange(len(interval)), float(noise.interval)
+        follows = ~restart & (interval <= 1.5 * usual)
+        own = np.where(follows, interval, usual)
+        # Of each sample's errors at its start (in column 0 on) and its end.
+        change = np.zeros((len(rows), 2 * len(rows)))
+        change[rows, len(rows) + rows] = 1.0 / own
+        change[rows, np.where(follows, len(rows) + rows - 1, rows)] = -1.0 / own
+        total = total + float(noise.integral) * change @ change.T
+    for decay, variance in zip(np.asarray(noise.decay), np.asarray(noise.variance), strict=True):
         if decay > 0:
             part = variance * np.exp(-decay * np.abs(time[:, None] - time))
         else:
@@ -68,10 +80,12 @@ def covariance(noise: MarkovSum, sampling: Sampling) -> np.ndarray:
     return total
 
 
-def draw(rng: np.random.Generator, kind: str) -> Case:
-    """Random processes and a random sampling of one kind."""
+def draw(rng: np.random.Generator, kind: str, integral: bool = False) -> Case:
+    """Random processes, with white noise of the integral or without, and a random sampling of one kind."""
     decay = np.concatenate([[0.0], 10.0 ** rng.uniform(-3, 0.5, STATES - 1)])
     noise = MarkovSum(jnp.asarray(decay), jnp.asarray(10.0 ** rng.uniform(-3, 1.5, STATES)))
+    if integral:
+        noise = noise._replace(integral=jnp.asarray(10.0 ** rng.uniform(-2, 2)), interval=jnp.asarray(1.0))
     interval, white = np.ones(ROWS), np.ones(ROWS)
     restart, present = np.arange(ROWS) == 0, np.ones(ROWS, bool)
     if kind in ("unequal steps", "everything"):
@@ -90,10 +104,11 @@ def draw(rng: np.random.Generator, kind: str) -> Case:
 KINDS = ("even", "unequal steps", "missing samples", "restarts", "relative white variances", "everything")
 
 
+@pytest.mark.parametrize("integral", [False, True])
 @pytest.mark.parametrize("kind", KINDS)
-def test_filter_is_the_dense_cholesky_factor(kind: str, rng: np.random.Generator):
+def test_filter_is_the_dense_cholesky_factor(kind: str, integral: bool, rng: np.random.Generator):
     for _ in range(5):
-        case = draw(rng, kind)
+        case = draw(rng, kind, integral)
         columns, draws = rng.standard_normal((ROWS, 3)), rng.standard_normal(ROWS)
         white, transposed, coloured, log_determinant, (steps, pulses) = (
             jax.tree.map(np.asarray, x)

@@ -153,5 +153,5 @@ def _design(scanner: Scanner, baseline: Estimate, draws: int, seed: int) -> tupl
         means = np.array([part.mean() for part in np.array_split(values, min(COURSE, record.rows))])
         columns.append((means - values.mean()) / max(values.std(), 1e-300))
     sizes = np.log([record.rows, scanner.present.sum(), scanner.grid.interval, scanner.grid.span])
-    noise = np.log10(np.maximum([float(r) for r in baseline.ratios], 1e-12)) / 2.5
+    noise = np.log10(np.maximum([float(r) for r in baseline.ratios.each()], 1e-12)) / 2.5
     return hashlib.sha256(repr(same).encode()).hexdigest()[:32], np.concatenate([*columns, sizes, noise])

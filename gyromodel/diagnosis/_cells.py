@@ -121,14 +121,14 @@ class Cells:
 
     def _with_energies(self, cell: Cell) -> Cell:
         """CᵀV⁻¹C of every block and line, a few rows at a time."""
-        whole = [np.asarray(part) for part in cell.filter]
-        filters = [Filter(*(part[i : i + ROWS_TOGETHER] for part in whole)) for i in _row_starts(len(whole[0]))]
+        starts = _row_starts(len(cell.filter.transition))
+        filters = [jax.tree.map(lambda part, i=i: np.asarray(part)[i : i + ROWS_TOGETHER], cell.filter) for i in starts]
         blocks = {q: np.zeros((count, q, q)) for q, (_, count, _) in self._layout.items()}
         # Of each run, as noise starts anew there.
         pairs = np.zeros((len(self._lines.campaigns), len(self._lines.exact), 2, 2)) if self._lines else NO_LINES
         for pack in self._packs:
             state = at_rest(cell.filter, pack.rows[0].shape[1])
-            for i, filter, rows in zip(_row_starts(len(whole[0])), filters, pack.rows, strict=True):
+            for i, filter, rows in zip(starts, filters, pack.rows, strict=True):
                 state, whitened = _whiten_rows(state, filter, rows)
                 w = np.asarray(whitened)
                 for key, first, count, start in pack.parts:

@@ -25,6 +25,7 @@ from gyromodel.diagnosis._search import Progress, Selection
 from gyromodel.diagnosis._session import (
     Session,
     laid_out,
+    over_angle_noise,
     over_smooth_thermometers,
     over_unrounded,
     over_weighted,
@@ -126,6 +127,7 @@ def diagnose(
             break
     if rounding.changed and (left_out := int(np.sum(record.present & ~session.record.present))):
         findings.append(f"{left_out} samples that stand apart from all others were left out beside rounding.")
+    session, selection = over_angle_noise(session, selection, model, say) or (session, selection)
     if record.domain == "gyro" and (others := over_smooth_thermometers(session, selection, model, say)):
         session, selection = others
         findings.append(SMOOTHED)
@@ -199,13 +201,14 @@ def diagnose(
         judgement = structured(judgement, selection.last, grows.column)
     stepped = None
     if plain and not selection.unfinished and (free := _with_noise_estimated(selection.estimate)):
-        stepped = quantisation(free, session.threshold)
+        stepped = quantisation(free, session.threshold, last if last.noise_given else None)
     if stepped is not None:
         beyond.append(stepped)
         size = stepped.parameters[0].value
         findings.append(
             f"The noise from sample to sample is in part that of quantisation, {size:.3g} arcsec (white noise of the "
-            "angle); fits take it as white noise of the rate."
+            "angle)"
+            + ("; fits in the noise that is stated take it as white noise of the rate." if last.noise_given else ".")
         )
     elif plain and not selection.unresolved and (band := excess_band(selection.estimate)):
         findings.append(band)
@@ -337,7 +340,7 @@ def _with_noise_estimated(estimate: Estimate) -> Estimate | None:
 def _like_hops(selection: Selection, free: Estimate) -> bool:
     """Whether all that was found is what hops of the bias could be taken for; `free` has its noise estimated."""
     in_time = all(f.frees_noise or f.name in (*SLOW_IN_TIME, "bias_periodic") for f in selection.found)
-    slow = any(float(r) > 0 for r in free.ratios)
+    slow = any(float(r) > 0 for r in free.ratios[:3])
     return in_time and selection.driver in (None, "smooth(time)") and (slow or bool(selection.found))
 
 

@@ -1,4 +1,4 @@
-"""Noise of kinds that a fit cannot hold: quantisation, hops between two levels, a level that varies."""
+"""Noise that is no colour: of the angle, hops between two levels, a level that varies."""
 
 from __future__ import annotations
 
@@ -8,25 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy import stats
-from scipy.fft import dst
 from scipy.optimize import minimize
 
-from gyromodel.diagnosis._evidence import log_sum
 from gyromodel.diagnosis._result import Cause, ParameterValue
-from gyromodel.estimate import Estimate, filter_of
+from gyromodel.estimate import Estimate, angle_noise, even_stretches, filter_of, fit_record, with_noise_intervals
+from gyromodel.noise import NoiseRatios
 from gyromodel.numerics.rounding import quantum
 from gyromodel.signals import Record
 from gyromodel.units import factor
 
-# Even stretches shorter than this show no correlation from sample to sample.
-STRETCH = 16
-# Quantisation variances over white ones that are tried.
-SHARES = np.geomspace(1e-3, 1e3, 61)
-# Times the variance that a line has at its frequency, parts of the frequencies that may be lines, turns of their fit.
-LINE, LINES, TURNS = 20.0, (1e-6, 0.01, 0.03, 0.1), 20
-# Where a band may begin, in the units of quantisation's spectrum (0.1 to 0.45 times the sample rate), and by how much.
-EDGES, RAISED = 2.0 - 2.0 * np.cos(2.0 * np.pi * np.linspace(0.1, 0.45, 8)), np.geomspace(0.1, 300.0, 16)
-CHI_MEDIAN = float(stats.chi2.median(1))
 # A record with fewer hops than this has steps, each with an epoch of its own; fewer rows show no hops.
 FEWEST_HOPS, FEWEST_ROWS = 4, 100
 # Lead (nats) over coloured noise and steps from which hops are told.
@@ -51,42 +41,31 @@ def as_cause(name: str, evidence: float, *sizes: ParameterValue) -> Cause:
     return Cause(name, sizes, evidence, p, p, 1.0)
 
 
-def quantisation(estimate: Estimate, threshold: float) -> Cause | None:
-    """Quantisation noise (white noise of the angle) in what a fit leaves, by its falling correlation.
+def quantisation(estimate: Estimate, threshold: float, stated: Estimate | None = None) -> Cause | None:
+    """Quantisation noise (white noise of the angle) that a fit with its noise estimated has found.
 
-    Its covariance over an even stretch is tridiagonal, and the sine transform diagonalises it.
+    Beside a fit in stated noise that has some of it, where there is more.
     """
-    record, known = estimate.record, np.isfinite(estimate.whitened)
-    ends = np.flatnonzero((np.diff(_stretch(record), prepend=0) > 0) | ~known)
-    stretches = [e[np.isfinite(e)] for e in np.split(estimate.whitened, ends)]
-    stretches = [e for e in stretches if len(e) >= STRETCH]
-    if not stretches:
+    if estimate.ratios.quantisation is None:
         return None
-    if not any(e.any() for e in stretches):
+    flicker, walk, markov, constant, angle = estimate.ratios.each()
+    # As fits without it find them: beside white noise that holds its variance too.
+    whole = 1.0 + 2.0 * angle
+    without = NoiseRatios(flicker / whole, walk / whole, markov / whole, constant)
+    held = 0.0 if stated is None else float(stated.model.noise.get("noise_quantisation", 0.0))
+    before = stated if held else fit_record(estimate.record, estimate.model_as_given(), ratios=without)
+    assert before is not None
+    found = angle_noise(before.whitened, estimate.record)
+    if found is None or found.evidence < threshold:
         return None
-    power = np.concatenate([np.square(np.asarray(dst(e, type=1, norm="ortho"))) for e in stretches])
-    spectrum = np.concatenate([2.0 - 2.0 * np.cos(np.pi * np.arange(1, len(e) + 1) / (len(e) + 1)) for e in stretches])
-    white, likelihood = _spectral_fit(power, 1.0 + np.append(0.0, SHARES)[:, None] * spectrum)
-    evidence = log_sum(likelihood[1:]) - likelihood[0] - np.log(len(SHARES))
-    if evidence < threshold:
-        return None
-    # Many weak lines, or noise of a band, raise the spectrum from some frequency on.
-    band = spectrum >= EDGES[:, None]
-    other = _spectral_fit(power, 1.0 + (RAISED[:, None, None] * band).reshape(-1, len(power)))[1]
-    if log_sum(other) - np.log(len(other)) > likelihood[0] + evidence:
-        return None
-    white, gain = white[1:], likelihood[1:]
-    weight = np.exp(gain - log_sum(gain))
-    unit = record.interval * np.sqrt(estimate.white_variance) / abs(float(estimate.model.gain()))
-    sizes = unit * np.sqrt(SHARES * white)
-    value = float(weight @ sizes)
-    std = float(np.sqrt(weight @ (sizes - value) ** 2 + (value**2) / (2.0 * len(power))))
+    estimate = with_noise_intervals(estimate)
     scale = factor("rad", "arcsec")
-    return as_cause(
-        "noise_quantisation",
-        float(evidence),
-        ParameterValue("noise_quantisation", value * scale, std * scale, "arcsec"),
-    )
+    value = float(estimate.model.noise["noise_quantisation"])
+    low, high = estimate.noise_interval["noise_quantisation"]
+    if low < held:
+        return None
+    size = ParameterValue("noise_quantisation", value * scale, (high - low) / 3.92 * scale, "arcsec")
+    return as_cause("noise_quantisation", found.evidence, size)
 
 
 def telegraph(baseline: Estimate, extended: Estimate, unit: str) -> Cause | None:
@@ -102,7 +81,7 @@ def telegraph(baseline: Estimate, extended: Estimate, unit: str) -> Cause | None
         return None
     spread = residual[here].std()
     y = (residual[here] - residual[here].mean()) / spread
-    restart = np.diff(_stretch(record)[here], prepend=-1) != 0
+    restart = np.diff(even_stretches(record)[here], prepend=-1) != 0
     # Of a length that recurs; samples behind the last one count for nothing.
     samples = np.pad(y, (0, len(record.sampling.present) - count), constant_values=np.nan)
     opens = np.resize(restart, len(samples))
@@ -125,7 +104,8 @@ def telegraph(baseline: Estimate, extended: Estimate, unit: str) -> Cause | None
         return None
     # Both in nats of the same samples; every free number of each costs half of ln n.
     other = _normal(extended, spread)
-    extra = len(extended.model.slots()) - len(baseline.model.slots()) + sum(float(r) > 0 for r in extended.ratios)
+    extra = len(extended.model.slots()) - len(baseline.model.slots())
+    extra += sum(float(r) > 0 for r in extended.ratios.each())
     lead = -best.fun - other - 0.5 * (len(best.x) - 2 - extra) * np.log(count)
     if lead < HOPS_LEAD or not LEAST_HELD < upper.mean() < 1.0 - LEAST_HELD:
         return None
@@ -144,38 +124,6 @@ def telegraph(baseline: Estimate, extended: Estimate, unit: str) -> Cause | None
         ),
     )
     return cause if scatter >= IRREGULAR else replace(cause, posterior=0.5)
-
-
-def _spectral_fit(power: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Level and log likelihood of each shape of a spectrum, of which a part of the frequencies are lines.
-
-    Normal coefficients of variance level · shape, or LINE times that where there is a line; by that algorithm which
-    weighs each frequency by how likely it has none (Dempster, Laird, Rubin 1977).
-    """
-    part = power / variance
-    level, best = part.mean(1), np.full(len(part), -np.inf)
-    levels = level
-    for lines in LINES:
-        level = np.maximum(np.median(part, axis=1) / CHI_MEDIAN, 1e-300)
-        for _ in range(TURNS):
-            each = part / level[:, None]
-            odds = lines / (1.0 - lines) / np.sqrt(LINE) * np.exp(np.minimum(0.5 * each * (1.0 - 1.0 / LINE), 700.0))
-            quiet = 1.0 / (1.0 + odds)
-            level = np.maximum(np.mean(part * (quiet + (1.0 - quiet) / LINE), axis=1), 1e-300)
-        each = part / level[:, None]
-        odds = lines / (1.0 - lines) / np.sqrt(LINE) * np.exp(np.minimum(0.5 * each * (1.0 - 1.0 / LINE), 700.0))
-        value = np.sum(np.log1p(odds) - 0.5 * each, axis=1) + len(power) * np.log(1.0 - lines)
-        value -= 0.5 * (np.log(variance).sum(1) + len(power) * np.log(level))
-        levels = np.where(value > best, level, levels)
-        best = np.maximum(best, value)
-    return levels, best
-
-
-def _stretch(record: Record) -> np.ndarray:
-    """Number of the even stretch without restart or gap that each row is of."""
-    sampling = record.sampling
-    opens = np.asarray(sampling.restart) | (np.asarray(sampling.interval) > 1.5 * record.interval)
-    return np.cumsum(opens[: record.rows])
 
 
 def _change(record: Record) -> np.ndarray:

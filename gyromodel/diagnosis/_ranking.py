@@ -250,7 +250,9 @@ def _of_markov(scanner: Scanner, walk: Any, columns: np.ndarray, residual: np.nd
     cells = markov_cells(scanner.degrees_of_freedom, grid.interval, grid.span)
     if not len(cells.markov):
         return np.zeros(0), np.zeros(0)
-    cells = cells._replace(walk=cells.walk + float(walk))
+    angle = grid.ratios.quantisation
+    angle = None if angle is None else np.ravel(angle)[0]
+    cells = cells._replace(walk=cells.walk + float(walk), quantisation=angle)
     result = restricted_likelihood(cells, grid.interval, grid.span, scanner.record.sampling, columns, residual)
     return result.log_likelihood + MARKOV_PRIOR - np.log(len(cells.markov)), np.asarray(
         cells.markov
@@ -298,12 +300,18 @@ def noise_kinds(scanner: Scanner, ranking: Ranking) -> dict[str, float]:
     """Posterior over what the noise is made of with nothing more added, the likeliest first."""
     logs: dict[str, list[float]] = {}
     flicker, walk = scanner.grid.ratios.flicker, scanner.grid.ratios.walk
+    angle = scanner.grid.ratios.quantisation is not None
     for g, r in ranking.results.items():
-        parts = (("noise_white", True), ("noise_flicker", flicker[g] > 0), ("noise_random_walk", walk[g] > 0))
+        parts = (
+            ("noise_white", True),
+            ("noise_flicker", flicker[g] > 0),
+            ("noise_random_walk", walk[g] > 0),
+            ("noise_quantisation", angle),
+        )
         kind = " + ".join(name for name, there in parts if there)
         logs.setdefault(kind, []).append(r.log_likelihood + ranking.log_prior[g])
     markov, _ = _of_markov(scanner, 0.0, ranking.baseline_columns, ranking.residual)
-    logs["noise_white + noise_markov"] = list(markov + MARKOV_NAMED - MARKOV_PRIOR)
+    logs["noise_white + noise_markov" + " + noise_quantisation" * angle] = list(markov + MARKOV_NAMED - MARKOV_PRIOR)
     total = log_sum([v for of_kind in logs.values() for v in of_kind])
     weight = {kind: float(np.exp(log_sum(v) - total)) for kind, v in logs.items() if v}
     return dict(sorted(weight.items(), key=lambda item: -item[1]))

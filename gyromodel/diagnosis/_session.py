@@ -77,7 +77,12 @@ class Session:
 
 
 def laid_out(
-    record: Record, model: GyroModel, threshold: float | None = None, step: float = 0.0, outliers: bool = True
+    record: Record,
+    model: GyroModel,
+    threshold: float | None = None,
+    step: float = 0.0,
+    outliers: bool = True,
+    start: NoiseRatios | None = None,
 ) -> Session:
     """A search on a record.
 
@@ -87,16 +92,32 @@ def laid_out(
         threshold: the safe one if none is given.
         step: of the coarsest reading behind its output.
         outliers: whether gross errors are looked for.
+        start: noise to begin with.
 
     Raises:
         EstimateError: the simulation cannot be fitted.
     """
-    baseline = fit_record(record, model)
+    baseline = fit_record(record, model, start=start)
     scanner = Scanner(
         record, build_bank(record), _grid(record, baseline), outliers=outliers, stated=baseline.noise_given, step=step
     )
     safe = safe_threshold(baseline.degrees_of_freedom)
     return Session(scanner, baseline, safe if threshold is None else threshold)
+
+
+def over_angle_noise(
+    session: Session, selection: Selection, model: GyroModel, say: Progress
+) -> tuple[Session, Selection] | None:
+    """The search beside white noise of the angle where it shows beside what was found, and not before."""
+    found, before = selection.estimate, session.baseline
+    if found.noise_given or found.ratios.quantisation is None or before.ratios.quantisation is not None:
+        return None
+    kept = {"step": session.scanner.step, "outliers": session.scanner.outliers}
+    try:
+        again = laid_out(session.record, model, session.threshold, start=found.ratios, **kept)
+    except EstimateError:
+        return None
+    return again, again.run(say)
 
 
 def over_unrounded(
@@ -187,7 +208,7 @@ def over_weighted(
     except EstimateError:
         return None
     kept = {"outliers": scanner.outliers, "stated": baseline.noise_given, "step": scanner.step}
-    weighted = Scanner(record, scanner.bank, scanner.grid, **kept)
+    weighted = Scanner(record, scanner.bank, _grid(record, baseline), **kept)
     again = Session(weighted, baseline, session.threshold)
     selection = again.run(say)
     return None if selection.unfinished else (again, selection)
@@ -195,17 +216,18 @@ def over_weighted(
 
 def _grid(record: Record, baseline: Estimate) -> NoiseGrid:
     """Noise cells: the whole family; where the model states its noise, that cell first."""
-    grid = noise_grid(int(record.present.sum()), record.interval, record.span)
+    grid, stated = noise_grid(int(record.present.sum()), record.interval, record.span), baseline.ratios
+    # White noise of the angle is told by its own frequencies, and held at what the fit says.
+    grid = grid._replace(ratios=grid.ratios._replace(quantisation=stated.quantisation))
     if not baseline.noise_given:
         return grid
-    stated, prior = baseline.ratios, grid.log_prior
-    each = [np.asarray(r) for r in np.broadcast_arrays(*grid.ratios)]
+    prior, each = grid.log_prior, [np.asarray(r) for r in np.broadcast_arrays(*grid.ratios.each())]
     if float(stated.markov):
         # Beside less of it than stated, which is none, as much: in the cells that can hold it.
         room = each[0] == 0
         level = np.stack(each)[:, room]
-        level[2:] = [[float(stated.markov)], [float(stated.constant)]]
+        level[2:4] = [[float(stated.markov)], [float(stated.constant)]]
         each = [np.concatenate([a, b]) for a, b in zip(each, level, strict=True)]
         prior = np.concatenate([prior, prior[room]])
-    ratios = NoiseRatios(*(np.append(float(a), b) for a, b in zip(stated, each, strict=True)))
+    ratios = NoiseRatios(*(np.append(float(a), b) for a, b in zip(stated.each(), each, strict=True)))
     return grid._replace(ratios=ratios, log_prior=np.concatenate([[0.0], prior]))

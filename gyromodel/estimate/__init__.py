@@ -1,25 +1,23 @@
 """Joint generalised least squares with the noise estimated alongside; estimates carry their covariance."""
 
+from gyromodel.estimate._angle_noise import angle_noise, even_stretches
 from gyromodel.estimate._calibration import Calibration, validity_unit
 from gyromodel.estimate._estimate import Estimate, EstimateError, calibration_of, noise_table
 from gyromodel.estimate._fit import (
     check_covariates,
-    filter_of,
     fit,
     fit_record,
     given_ratios,
-    make_filter,
-    pad_columns,
     read_for_fit,
     refuse_apart,
     refuse_missing,
-    whiten_columns,
 )
 from gyromodel.estimate._function import FunctionFit, fit_function
 from gyromodel.estimate._many import ManyFits, fit_many
 from gyromodel.estimate._noise import with_noise_intervals
 from gyromodel.estimate._rounding import Unrounded, as_read, step_of, unrounded, widened, with_reading, with_step_of
 from gyromodel.estimate._two_stage import two_stage
+from gyromodel.estimate._whitening import filter_of, make_filter, pad_columns, whiten_columns
 
 __all__ = [
     "Calibration",
@@ -28,9 +26,11 @@ __all__ = [
     "FunctionFit",
     "ManyFits",
     "Unrounded",
+    "angle_noise",
     "as_read",
     "calibration_of",
     "check_covariates",
+    "even_stretches",
     "filter_of",
     "fit",
     "fit_function",

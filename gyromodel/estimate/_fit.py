@@ -19,10 +19,11 @@ from gyromodel.estimate._estimate import Estimate, EstimateError, noise_coeffici
 from gyromodel.estimate._noise import best_ratios, settled, with_noise_intervals
 from gyromodel.estimate._optimistix import optimistix_solution
 from gyromodel.estimate._rounding import fit_readings, with_step_of
+from gyromodel.estimate._whitening import filter_of, pad_columns, whiten_columns
 from gyromodel.model import GyroModel, ModelError, check_domain, check_units
-from gyromodel.noise import NoiseRatios, from_grams, markov_sum, stated_ratios
+from gyromodel.noise import NoiseRatios, from_grams, stated_ratios
 from gyromodel.numerics.least_squares import Normal, Solution, levenberg_marquardt
-from gyromodel.numerics.state_space import Filter, build_filter, colour, whiten, whitened_gram
+from gyromodel.numerics.state_space import Filter, colour, whitened_gram
 from gyromodel.numerics.uncertain import Source
 from gyromodel.poses import at_rest
 from gyromodel.signals import Record, read_signals
@@ -211,21 +212,6 @@ def given_ratios(record: Record, model: GyroModel) -> NoiseRatios | None:
         raise ModelError(str(problem)) from None
 
 
-@jax.jit
-def make_filter(ratios: NoiseRatios, interval, longest, sampling) -> Filter:
-    """The whitening filter of noise cells of one longest time constant."""
-    return build_filter(markov_sum(ratios, interval, longest), sampling)
-
-
-def filter_of(record: Record, ratios: NoiseRatios) -> Filter:
-    """The whitening filter of one noise cell on a record."""
-    ratios = NoiseRatios(*(np.asarray(r, float) for r in ratios))
-    return make_filter(ratios, record.interval, float(ratios.longest(record.span)), record.sampling)
-
-
-whiten_columns = jax.jit(whiten)
-
-
 _gram = jax.jit(whitened_gram)
 
 
@@ -271,11 +257,6 @@ def _linear_start(model: GyroModel, x: np.ndarray, normal: Callable[[np.ndarray]
     ratio = float(model.with_vector(jnp.asarray(x + step)).gain() / model.with_vector(jnp.asarray(x)).gain())
     step[others] /= ratio if ratio else 1.0
     return x + step if normal(x + step)[2] < cost else x
-
-
-def pad_columns(columns, step: int = 8):
-    """Zero columns up to a multiple of `step`, so that compiled shapes recur."""
-    return np.pad(columns, ((0, 0), (0, -columns.shape[1] % step)))
 
 
 def _finish(

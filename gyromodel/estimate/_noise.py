@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
+from gyromodel.estimate._angle_noise import angle_noise
 from gyromodel.estimate._estimate import Estimate, EstimateError, noise_coefficients
 from gyromodel.estimate._rounding import white_before
+from gyromodel.estimate._whitening import filter_of, pad_columns, whiten_columns
 from gyromodel.model import GyroModel
 from gyromodel.noise import NoiseRatios, markov_cells, noise_grid, restricted_likelihood
 from gyromodel.signals import Record
@@ -20,8 +22,13 @@ Likelihood = Callable[[NoiseRatios], np.ndarray]
 COARSE_STEPS, FINE_STEPS = (0.8, 0.4, 0.2, 0.1), (0.7, 0.35, 0.17)
 # Noise is a Markov process rather than flicker and walk if it is so much likelier (nats).
 MARKOV_LEAD = 5.0
-# Levels of each noise ratio over its likely range, for the intervals of the noise coefficients, and between them.
+# White noise of the angle is beside it from this evidence on (nats).
+ANGLE_LEAD = 4.0
+# Levels of each noise ratio over its likely range, for the intervals of the noise coefficients, and between them; of
+# white noise of the angle, which is told from the others by its frequencies, fewer, within such factors at first.
 INTERVAL_LEVELS, FINER_LEVELS = 10, 41
+ANGLE_LEVELS, ANGLE_FINER, ANGLE_RANGE = 5, 11, np.geomspace(0.1, 10.0, 7)
+COUNTS, FINER_COUNTS = (*[INTERVAL_LEVELS] * 4, ANGLE_LEVELS), (*[FINER_LEVELS] * 4, ANGLE_FINER)
 # A unit of so many times the largest amplitude makes a scale even in amplitude.
 LINEAR = 1e3
 # Half the 95 % point of chi-squared with one degree of freedom.
@@ -35,7 +42,8 @@ def best_ratios(
 ) -> NoiseRatios:
     """The noise of greatest restricted likelihood: the grids, then ever finer squares around the best cell.
 
-    It is flicker and walk, unless a Markov process beside white noise is likelier by a margin.
+    It is flicker and walk, unless a Markov process beside white noise is likelier by a margin; with white noise of the
+    angle where the start has it, or where it shows in what these leave.
     """
     predicted, jacobian = model.linearise(record.signals)
     if not np.isfinite(jacobian).all():
@@ -51,17 +59,31 @@ def best_ratios(
     if coarse:
         grid = noise_grid(int(record.present.sum()), record.interval, span)
         # Every other level, then the levels around the best of them.
-        levels = [np.unique(r) for r in grid.ratios]
+        angle = start.each()[len(grid.ratios.each()) :]
+        levels = [np.unique(r) for r in (*grid.ratios.each(), *angle)]
         best, _ = _likeliest(likelihood, _mesh(level[::2] for level in levels))
-        best, top = _likeliest(likelihood, _mesh(map(_around, levels, map(float, best))))
+        best, top = _likeliest(likelihood, _mesh(map(_around, levels, map(float, best.each()))))
     best, top = _refined(likelihood, best, top, COARSE_STEPS if coarse else FINE_STEPS)
-    if not coarse or markov is False:
+    if not coarse:
         return best
-    cells = markov_cells(int(record.present.sum()), record.interval, span)
-    if not len(cells.flicker):
+    cells = markov_cells(int(record.present.sum()), record.interval, span)._replace(quantisation=start.quantisation)
+    if markov is not False and len(cells.flicker):
+        other, likeliest = _refined(likelihood, *_likeliest(likelihood, cells), COARSE_STEPS)
+        best = other if markov or likeliest > top + MARKOV_LEAD else best
+    if best.quantisation is not None or record.domain != "gyro":
         return best
-    other, likeliest = _refined(likelihood, *_likeliest(likelihood, cells), COARSE_STEPS)
-    return other if markov or likeliest > top + MARKOV_LEAD else best
+    columns = pad_columns(residual[:, None])
+    whitened = np.where(
+        record.present, np.asarray(whiten_columns(filter_of(record, best), columns))[: record.rows, 0], np.nan
+    )
+    found = angle_noise(whitened, record)
+    if found is None or found.evidence < ANGLE_LEAD:
+        return best
+    # What is left for white noise is less.
+    more = np.nanmean(whitened**2) / found.white
+    slow = [np.asarray(r) * more for r in (best.flicker, best.walk, best.markov)]
+    best = NoiseRatios(slow[0], slow[1], slow[2], best.constant, np.asarray(found.share))
+    return _refined(likelihood, best, None, COARSE_STEPS)[0]
 
 
 def _likeliest(likelihood: Likelihood, cells: NoiseRatios) -> tuple[NoiseRatios, float]:
@@ -75,7 +97,7 @@ def _refined(
 ) -> tuple[NoiseRatios, float]:
     """The likeliest cell around one, and its log likelihood; `top` is that of the one where it is known."""
     for width in steps:
-        cells = _mesh(np.asarray(r) * np.exp(width * np.array([-1.0, 0.0, 1.0])) for r in best)
+        cells = _mesh(np.asarray(r) * np.exp(width * np.array([-1.0, 0.0, 1.0])) for r in best.each())
         if top is not None:
             # The middle one is known.
             cells = cells.take(np.delete(np.arange(len(cells.flicker)), len(cells.flicker) // 2))
@@ -97,7 +119,9 @@ def _mesh(levels: Iterable[np.ndarray]) -> NoiseRatios:
 
 
 def settled(a: NoiseRatios, b: NoiseRatios) -> bool:
-    return all(abs(np.log((float(x) + 1e-300) / (float(y) + 1e-300))) < 0.05 for x, y in zip(a, b, strict=True))
+    pairs = list(zip(a.each(), b.each(), strict=False))
+    alike = len(a.each()) == len(b.each())
+    return alike and all(abs(np.log((float(x) + 1e-300) / (float(y) + 1e-300))) < 0.05 for x, y in pairs)
 
 
 def with_noise_intervals(estimate: Estimate) -> Estimate:
@@ -116,19 +140,21 @@ def with_noise_intervals(estimate: Estimate) -> Estimate:
     grid = noise_grid(samples, record.interval, span).ratios
     if float(estimate.ratios.markov) > 0:
         grid = markov_cells(samples, record.interval, span)
+    own = estimate.ratios.each()
     levels = [
         np.union1d(np.unique(r)[::2], float(b) * np.array([0.2, 1.0, 5.0]))
-        for r, b in zip(grid, estimate.ratios, strict=True)
+        for r, b in zip(grid.each(), own, strict=False)
     ]
+    levels += [float(b) * ANGLE_RANGE for b in own[len(levels) :]]
     for turn, margin in enumerate((4.0, 2.0, 2.0, 2.0, 0.0)):
         result = restricted_likelihood(_mesh(levels), record.interval, span, record.sampling, jacobian, residual)
         below = result.log_likelihood.max() - result.log_likelihood
         # Only levels even on some scale are for splines.
-        if not margin or (turn and np.sum(below < REJECTED) > 2 * INTERVAL_LEVELS):
+        if not margin or (turn and np.sum(below < REJECTED) > 2 * INTERVAL_LEVELS * ANGLE_LEVELS ** (len(own) - 4)):
             break
-        likely, mesh = below < margin * REJECTED, [np.asarray(r) for r in _mesh(levels)]
-        units = [_unit(r, likely, float(b)) for r, b in zip(mesh, estimate.ratios, strict=True)]
-        levels = [_levels(r, likely, unit) for r, unit in zip(mesh, units, strict=True)]
+        likely, mesh = below < margin * REJECTED, [np.asarray(r) for r in _mesh(levels).each()]
+        units = [_unit(r, likely, float(b)) for r, b in zip(mesh, own, strict=True)]
+        levels = [_levels(r, likely, unit, n) for r, unit, n in zip(mesh, units, COUNTS, strict=False)]
     # A likelihood that falls off steeply would make splines swing where it does not.
     hoped = np.maximum(result.log_likelihood, result.log_likelihood.max() - HOPELESS * REJECTED)
     finer, (log_likelihood, log_sum) = _finer(levels, units, hoped, np.log(result.residual_sum))
@@ -139,6 +165,9 @@ def with_noise_intervals(estimate: Estimate) -> Estimate:
     low, high = spans["noise_white"]
     scatter = 1.96 / float(np.sqrt(2 * (record.present.sum() - 1)))
     spans["noise_white"] = white_before(estimate, (low * (1 - scatter), high * (1 + scatter)))
+    if "noise_quantisation" in spans:
+        low, high = spans["noise_quantisation"]
+        spans["noise_quantisation"] = low * (1 - scatter), high * (1 + scatter)
     if len(grid.flicker) == 1:
         # So few samples show no colour: there may be any amount of it.
         spans |= {name: (0.0, np.inf) for name in spans if name != "noise_white"}
@@ -164,12 +193,12 @@ def _ratio(place: np.ndarray, unit: float) -> np.ndarray:
     return (unit * np.sinh(place)) ** 2
 
 
-def _levels(ratio: np.ndarray, likely: np.ndarray, unit: float) -> np.ndarray:
+def _levels(ratio: np.ndarray, likely: np.ndarray, unit: float, count: int) -> np.ndarray:
     """Levels of one noise ratio, even on the scale of a unit, from the one below its likely range to the one above."""
     levels = np.unique(ratio)
     first, last = np.searchsorted(levels, [ratio[likely].min(), ratio[likely].max()])
     low, high = _on_scale(levels[[max(first - 1, 0), min(last + 1, len(levels) - 1)]], unit)
-    return np.unique(_ratio(np.linspace(low, high, INTERVAL_LEVELS), unit))
+    return np.unique(_ratio(np.linspace(low, high, count), unit))
 
 
 def _finer(
@@ -177,7 +206,7 @@ def _finer(
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Levels closer together on their scales, where there are several, and what cubic splines make of values there."""
     places = [_on_scale(r, unit) for r, unit in zip(levels, units, strict=True)]
-    closer = [np.linspace(p[0], p[-1], FINER_LEVELS if len(p) > 1 else 1) for p in places]
+    closer = [np.linspace(p[0], p[-1], n if len(p) > 1 else 1) for p, n in zip(places, FINER_COUNTS, strict=False)]
     made = []
     for value in values:
         grid = value.reshape([len(p) for p in places])

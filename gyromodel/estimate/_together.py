@@ -73,14 +73,15 @@ def ready(place: int, record: Record, given: Prepared) -> Waiting:
     prepared = given if model is given.model else described(model)
     check_enough(record, len(prepared.start))
     ratios = given_ratios(record, model)
-    coloured = ratios is not None and any(float(r) > 0 for r in ratios[:3])
+    coloured = ratios is not None and any(float(r) > 0 for r in (*ratios[:3], *ratios.each()[4:]))
     return Waiting(place, record, model, prepared.start, prepared.structure, ratios if coloured else None)
 
 
 def kind_of(campaign: Waiting) -> tuple:
     """What must be alike for one program: blocks (a power of two), model structure, signals, colour of the noise."""
     blocks = 2 ** max(int(np.ceil(np.log2(campaign.record.rows / BLOCK))), 0)
-    return blocks, campaign.structure, tuple(sorted(campaign.record.signals)), campaign.ratios is None
+    noise = 0 if campaign.ratios is None else len(campaign.ratios.each())
+    return blocks, campaign.structure, tuple(sorted(campaign.record.signals)), noise
 
 
 class _Noise(NamedTuple):

@@ -13,8 +13,8 @@ from jaxtyping import Array, Float
 
 from gyromodel._checks import thermometers
 from gyromodel.estimate._estimate import Estimate, EstimateError
-from gyromodel.estimate._fit import filter_of
 from gyromodel.estimate._optimistix import response_to_changes
+from gyromodel.estimate._whitening import filter_of
 from gyromodel.model import GyroModel
 from gyromodel.noise import NoiseRatios
 from gyromodel.numerics.uncertain import Uncertain

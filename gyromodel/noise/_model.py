@@ -1,7 +1,7 @@
-"""White noise, flicker, random walk and Markov noise relative to the white variance.
+"""White noise, flicker, random walk, Markov and quantisation noise relative to the white variance.
 
 Conventions, two-sided rate PSD and Allan variance: white N² and N²/τ, flicker B²/(2πf) and (2 ln2/π)B², random walk
-K²/(2πf)² and K²τ/3, Markov (q T)²/(1 + (2πf T)²) with variance q²T/2.
+K²/(2πf)² and K²τ/3, Markov (q T)²/(1 + (2πf T)²) with variance q²T/2, quantisation (2πf)²Q²τ0 and 3Q²/τ².
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from gyromodel.numerics.state_space import MarkovSum
 MARKOV_TIME = "noise_markov_time"
 # What a model can state of its noise, by public id, and the units it is written in.
 NOISE_UNITS = {
-    name: NOISE[name].unit for name in ("noise_white", "noise_flicker", "noise_random_walk", "noise_markov")
+    name: NOISE[name].unit
+    for name in ("noise_white", "noise_flicker", "noise_random_walk", "noise_markov", "noise_quantisation")
 } | {MARKOV_TIME: "s"}
 
 # The same of an angle, such as that of a platform's base.
@@ -50,17 +51,23 @@ MARKOV_LEVELS, MARKOV_STEP = 8, 4.0
 class NoiseRatios(NamedTuple):
     """Flicker B², random walk K²·(one sample interval) and Markov q²T/2, each over the white variance of a sample.
 
-    A cell holds flicker or a Markov process of time constant T (s), never both.
+    A cell holds flicker or a Markov process of time constant T (s), never both. Quantisation is Q² over the square of a
+    sample interval; none is another structure than zero, with a state less to filter.
     """
 
     flicker: Float[Array | np.ndarray, "*cell"]
     walk: Float[Array | np.ndarray, "*cell"]
     markov: Float[Array | np.ndarray, "*#cell"] = np.zeros(())
     constant: Float[Array | np.ndarray, "*#cell"] = np.zeros(())
+    quantisation: Float[Array | np.ndarray, "*#cell"] | None = None
+
+    def each(self) -> tuple[Any, ...]:
+        """Those there are."""
+        return tuple(ratio for ratio in self if ratio is not None)
 
     def take(self, index: int | np.ndarray) -> NoiseRatios:
         """Some cells."""
-        return NoiseRatios(*(x[index] for x in np.broadcast_arrays(*self)))
+        return NoiseRatios(*(x[index] for x in np.broadcast_arrays(*self.each())))
 
     def longest(self, span: float) -> np.ndarray:
         """The longest time constant of each cell: the span of the record that flicker needs, or T."""
@@ -86,7 +93,10 @@ def markov_sum(ratios: NoiseRatios, interval: float | Array, longest: float | Ar
     spacing = jnp.log(longest / interval) / (FLICKER_STATES - 1)
     each = ratios.flicker * spacing / jnp.pi
     decay = jnp.concatenate([jnp.zeros(1), 1.0 / constants])
-    return MarkovSum(decay, jnp.stack([ratios.walk / interval, *[each] * (FLICKER_STATES - 1), each + ratios.markov]))
+    variance = jnp.stack([ratios.walk / interval, *[each] * (FLICKER_STATES - 1), each + ratios.markov])
+    if ratios.quantisation is None:
+        return MarkovSum(decay, variance)
+    return MarkovSum(decay, variance, ratios.quantisation * interval**2 * jnp.ones_like(each), interval)
 
 
 def noise_grid(samples: int, interval: float, span: float) -> NoiseGrid:
@@ -125,9 +135,11 @@ def _half_on_absent(count: int) -> np.ndarray:
 def coefficients(ratios: NoiseRatios, white_variance: Any, interval: float) -> dict[str, Any]:
     """N, B, K as input rates (rad/s/√Hz, rad/s, rad/s/√s) from ratios and white variances of a sample.
 
-    Of cells with Markov noise N, q and T, in rad/s/√Hz, rad/s/√s and s.
+    Of cells with Markov noise N, q and T, in rad/s/√Hz, rad/s/√s and s. With quantisation also Q, in rad.
     """
     white = {"noise_white": np.sqrt(white_variance * interval)}
+    if ratios.quantisation is not None:
+        white["noise_quantisation"] = np.sqrt(np.asarray(ratios.quantisation) * white_variance) * interval
     markov, constant = np.asarray(ratios.markov), np.asarray(ratios.constant)
     if np.any(markov > 0):
         q = np.sqrt(2.0 * markov * white_variance / constant)
@@ -157,4 +169,5 @@ def stated_ratios(noise: Mapping[str, Any], interval: float) -> NoiseRatios:
     flicker, walk = stated.get("noise_flicker", 0.0), stated.get("noise_random_walk", 0.0)
     q, constant = stated.get("noise_markov", 0.0), stated.get(MARKOV_TIME, 0.0)
     ratios = (flicker**2 / variance, walk**2 * interval / variance, q**2 * constant / 2.0 / variance, constant)
-    return NoiseRatios(*(jnp.asarray(r) for r in ratios))
+    angle = stated.get("noise_quantisation", 0.0)
+    return NoiseRatios(*(jnp.asarray(r) for r in (*ratios, *[angle**2 / interval**2 / variance] * (angle > 0))))

@@ -22,7 +22,12 @@ from gyromodel.study._mission import Mission, Outcome, rate
 from gyromodel.units import factor, internal_unit
 
 # The kinds of noise by the field of NoiseRatios that holds them; white is what is left.
-KINDS = {"noise_flicker": "flicker", "noise_random_walk": "walk", "noise_markov": "markov"}
+KINDS = {
+    "noise_flicker": "flicker",
+    "noise_random_walk": "walk",
+    "noise_markov": "markov",
+    "noise_quantisation": "quantisation",
+}
 
 
 class Row(NamedTuple):
@@ -236,7 +241,7 @@ def _each_axis(mission: Mission, record: Record, rows: np.ndarray | None) -> tup
             raise ModelError(str(problem)) from None
         span = record.span
         white = float(model.noise["noise_white"]) ** 2 / record.interval
-        ratios = NoiseRatios(*(np.asarray(r, float) for r in ratios))
+        ratios = NoiseRatios(*(np.asarray(r, float) for r in ratios.each()))
         none = NoiseRatios(np.zeros(()), np.zeros(()), np.zeros(()), ratios.constant)
         cells = [none] + [none._replace(**{field: getattr(ratios, field)}) for field in KINDS.values()]
         caused = []
@@ -245,7 +250,8 @@ def _each_axis(mission: Mission, record: Record, rows: np.ndarray | None) -> tup
             if rows is None:
                 states = markov_sum(cell, record.interval, longest).variance
                 walked = float(states[0]) * np.asarray(mission.signals["time"])[: record.rows]
-                caused.append(white * (mission.together + walked + float(states[1:].sum())))
+                differences = 2.0 * float(cell.quantisation or 0.0) * mission.together**2
+                caused.append(white * (mission.together + walked + float(states[1:].sum()) + differences))
             else:
                 through = _through_noise(cell, record.interval, longest, record.sampling, jnp.asarray(rows[:, axis]))
                 caused.append(white * np.asarray(through))
