@@ -25,6 +25,7 @@ from gyromodel.effects import Signals
 from gyromodel.effects.power_cycles import BiasTurnOn, cycles
 from gyromodel.estimate import Calibration, check_covariates, step_of, validity_unit
 from gyromodel.model import GyroModel, ModelError, check_domain, check_units
+from gyromodel.noise_level import with_stated_level
 from gyromodel.signals import Record, read_signals
 from gyromodel.units import from_internal
 
@@ -162,12 +163,20 @@ def _estimate(calibration: Calibration, record: Record) -> tuple[np.ndarray, np.
     signals = {name: values for name, values in record.signals.items() if name in names}
     output = jnp.where(record.sampling.present, record.signals["output"], jnp.nan)
     white = jnp.asarray(model.noise.get("noise_white", 0.0)) ** 2 / record.interval
-    white += 2.0 * (model.noise.get("noise_quantisation", 0.0) / record.interval) ** 2
+    # Of an angle's and of an output's steps, which have one level.
+    steps = 2.0 * (model.noise.get("noise_quantisation", 0.0) / record.interval) ** 2
     if model.noise:
-        white += (step_of(model, record) / model.gain()) ** 2 / 12.0  # of rounding
+        steps += (step_of(model, record) / model.gain()) ** 2 / 12.0
     spread = np.zeros((len(model.slots()),) * 2) if covariance is None else covariance
     # The whole record at once: effects may look at what came before.
-    found = _solve(model, jnp.asarray(spread), white, signals, output)
+    level = jnp.ones(output.shape)
+    found = _solve(model, jnp.asarray(spread), white * level + steps, signals, output)
+    if model.level is not None:
+        # A level that follows the rate follows that which was found.
+        rated = record._replace(signals={**record.signals, "rate": jnp.nan_to_num(found[0])})
+        known = rated if model.level.driver == "rate" else record
+        level = with_stated_level(known, model).sampling.white / record.sampling.white
+        found = _solve(model, jnp.asarray(spread), white * level + steps, signals, output)
     rate, variance = (np.asarray(values)[: record.rows] for values in found)
     return rate, variance if _held(calibration) else np.full_like(variance, np.nan)
 
@@ -243,7 +252,7 @@ def told(
 def _solve(
     model: GyroModel,
     covariance: Float[Array, "parameter parameter"],
-    white: Float[Array, ""],
+    white: Float[Array, " sample"],
     signals: Signals,
     output: Float[Array, " sample"],
 ) -> tuple[Float[Array, " sample"], Float[Array, " sample"]]:

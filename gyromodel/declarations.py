@@ -98,7 +98,7 @@ NOISE = {
             "Log the laser current beside: hops of modes come with it; what switches nearby keeps a regular pace.",
         ),
         NoiseKind(
-            "noise_heteroscedastic", "1", 2.0, "–", "–", "a level that follows rate, temperature or time; not stated",
+            "noise_heteroscedastic", "1", 2.0, "–", "–", "level at one end of rate, temperature, its rate or time over that at the other",
             "Its source grows with the rate (a table's motion) or with the temperature (less light, more current).",
             "Log at rest at several temperatures, and at several rates at one temperature.",
         ),

@@ -46,12 +46,28 @@ class Slot(NamedTuple):
     linear: bool
 
 
+class Level(NamedTuple):
+    """The column that the noise level follows, and the two of its values that the ratio of levels is of.
+
+    Internal units; of rate and temperature_rate the size.
+    """
+
+    driver: str
+    low: float
+    high: float
+
+
+# What the noise level may follow, and the units it is written in.
+LEVEL_UNITS = {"rate": "deg/s", "temperature": "degC", "temperature_rate": "degC/s", "time": "s"}
+
+
 class GyroModel(eqx.Module):
     """output = Π gains · (u + output terms of u) + noise, u = (rate + Σ rate terms) · (1 + Σ scale terms).
 
     `noise` holds coefficients in internal units by noise id, or is empty for "estimate it"; `fixed` names the
     parameters that are known, as (effect label, field); `noise_of` says whether the noise is stated as that of a gyro's
-    rate or of a platform's angle. A model without effects and noise is of either.
+    rate or of a platform's angle, and `level` what its level follows, by a factor of noise_heteroscedastic. A model
+    without effects and noise is of either.
     """
 
     effects: tuple[Effect, ...]
@@ -61,6 +77,9 @@ class GyroModel(eqx.Module):
     fixed: frozenset[tuple[str, str]] = eqx.field(static=True, default=frozenset())
     gyro: str = eqx.field(static=True, default="")
     noise_of: Domain = eqx.field(static=True, default="gyro")
+    level: Level | None = eqx.field(
+        static=True, converter=lambda given: given and Level(given[0], *map(float, given[1:])), default=None
+    )
 
     def __check_init__(self) -> None:
         labels = [e.label for e in self.effects]
@@ -70,6 +89,9 @@ class GyroModel(eqx.Module):
         unknown = set(self.noise) - set(NOISE_UNITS)
         if unknown:
             raise ModelError(f"unknown noise {min(unknown)}; known are {', '.join(NOISE_UNITS)}")
+        stated = self.level is not None and self.level.driver in LEVEL_UNITS and self.level.low < self.level.high
+        if "noise_heteroscedastic" in self.noise and not stated:
+            raise ModelError("noise_heteroscedastic needs what it follows, from a value to a larger one")
         kinds: dict[str, str] = {e.domain: e.label for e in self.effects} | (
             {self.noise_of: "noise"} if self.noise else {}
         )

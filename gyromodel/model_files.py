@@ -20,13 +20,15 @@ from gyromodel.effects.drivers import BiasColumn
 from gyromodel.effects.scale import ScaleTemperatureCurve
 from gyromodel.effects.thermal import BiasTemperatureCurve
 from gyromodel.estimate import Calibration, Estimate, validity_unit
-from gyromodel.model import GyroModel, ModelError, make_effect, parameter_unit
+from gyromodel.model import LEVEL_UNITS, GyroModel, Level, ModelError, make_effect, parameter_unit
 from gyromodel.noise import MARKOV_TIME, NOISE_UNITS, check_stated, noise_units
 from gyromodel.numerics.uncertain import Source, Uncertain
 from gyromodel.signals import Record
 from gyromodel.units import convertible, from_internal, internal_unit
 
 # Written into fitted models; `read_calibration` reads them, and no other use of the model needs them.
+# How what a noise level follows is written.
+LEVEL_KEYS = ("driver", "from", "to")
 RECORD_KEYS = ("fit", "software")
 # What a scale factor can be: output per rate; a plain number where the output is itself a rate.
 GAIN_UNITS = ("count/deg", "count/(deg/s)", "bit/deg", "bit/(deg/s)", "V/(deg/s)", "V/deg", "A/(deg/s)", "1/deg", "")
@@ -126,10 +128,10 @@ def _read(path: Path) -> tuple[GyroModel, dict[str, Place]]:
     lines = {name for e in curves if e.coefficients.size and not fixed[e.label] for name in e.supersedes}
     effects = [e for e in effects if e.label not in lines or fixed[e.label]]
     of: list[Domain] = [effects[0].domain] if effects else ["gyro", "platform"]
-    noise, noise_of = _read_noise(top["noise"], of) if "noise" in top else ({}, of[0])
+    noise, noise_of, level = _read_noise(top["noise"], of) if "noise" in top else ({}, of[0], None)
     gyro = top["gyro"].text() if "gyro" in top else ""
     try:
-        return GyroModel(tuple(effects), noise, frozenset().union(*fixed.values()), gyro, noise_of), top
+        return GyroModel(tuple(effects), noise, frozenset().union(*fixed.values()), gyro, noise_of, level), top
     except ModelError as problem:
         raise top["effects"].error(str(problem)) from None
 
@@ -242,15 +244,17 @@ def _read_setting(place: Place, effect: Effect, name: str) -> Any:
     return place.quantity()[0] if isinstance(effect, BiasColumn) else place.number_in(SETTING_UNITS[name])
 
 
-def _read_noise(place: Place, of: list[Domain]) -> tuple[dict[str, float], Domain]:
-    """Coefficients, and what they are the noise of: one of those given, all in its units."""
+def _read_noise(place: Place, of: list[Domain]) -> tuple[dict[str, float], Domain, Level | None]:
+    """Coefficients; what they are the noise of, one of those given, all in its units; and what the level follows."""
     if isinstance(place.node, yaml.ScalarNode):
         if place.text() != "auto":
             raise place.error('noise is "auto" or a list of noise_* effects with values')
-        return {}, of[0]
+        return {}, of[0], None
     noise: dict[str, float] = {}
+    level = None
     for item in place.items("noise"):
-        entry = item.mapping(("effect", "value", "lo", "hi", "time_constant"), "a noise entry")
+        keys = ("effect", "value", "lo", "hi", "time_constant", *LEVEL_KEYS)
+        entry = item.mapping(keys, "a noise entry")
         if "effect" not in entry or "value" not in entry:
             raise item.error("each noise entry needs an effect: id and a value")
         name = entry["effect"].text()
@@ -270,11 +274,28 @@ def _read_noise(place: Place, of: list[Domain]) -> tuple[dict[str, float], Domai
             if name != "noise_markov":
                 raise entry["time_constant"].error(f"{name} has no time_constant")
             noise[MARKOV_TIME] = entry["time_constant"].number_in(NOISE_UNITS[MARKOV_TIME])
+        if name == "noise_heteroscedastic":
+            level = _read_level(item, entry)
+        elif extra := next((key for key in LEVEL_KEYS if key in entry), None):
+            raise entry[extra].error(f"{name} has no {extra}")
     try:
         check_stated(noise)
     except ValueError as problem:
         raise place.error(str(problem)) from None
-    return noise, of[0]
+    return noise, of[0], level
+
+
+def _read_level(item: Place, entry: dict[str, Place]) -> Level:
+    """What a noise level follows: `driver` with its values `from` and `to`."""
+    if missing := next((key for key in LEVEL_KEYS if key not in entry), None):
+        raise item.error(f"noise_heteroscedastic needs {missing}: it is the level at `to` over that at `from`")
+    driver = entry["driver"].text()
+    if driver not in LEVEL_UNITS:
+        raise entry["driver"].error(f"noise_heteroscedastic follows one of {', '.join(LEVEL_UNITS)}")
+    low, high = (entry[key].number_in(LEVEL_UNITS[driver]) for key in LEVEL_KEYS[1:])
+    if not low < high:
+        raise entry["to"].error("noise_heteroscedastic goes from a value to a larger one")
+    return Level(driver, low, high)
 
 
 def write_model(model: GyroModel | Estimate, path: str | Path) -> None:
@@ -319,6 +340,11 @@ def _document(model: GyroModel, estimate: Estimate | None) -> dict[str, Any]:
         document["effects"].append(entry)
     units = noise_units(model.noise_of)
     noise = {k: {"effect": k, "value": exact_text(float(v), units[k])} for k, v in model.noise.items()}
+    if "noise_heteroscedastic" in noise and model.level is not None:
+        driver, *ends = model.level
+        texts = [driver, *(exact_text(end, LEVEL_UNITS[driver]) for end in ends)]
+        ratio = float(model.noise["noise_heteroscedastic"])
+        noise["noise_heteroscedastic"] |= {"value": ratio, **dict(zip(LEVEL_KEYS, texts, strict=True))}
     if MARKOV_TIME in noise:
         noise["noise_markov"]["time_constant"] = noise.pop(MARKOV_TIME)["value"]
     document["noise"] = list(noise.values()) or "auto"

@@ -11,6 +11,7 @@ from gyromodel.campaign import Campaign
 from gyromodel.effects.converter import Quantisation
 from gyromodel.model import GyroModel, ModelError, check_reading, check_units
 from gyromodel.noise import NoiseRatios, markov_sum, stated_ratios
+from gyromodel.noise_level import with_stated_level
 from gyromodel.numerics.state_space import build_filter, colour
 from gyromodel.signals import Record, read_signals
 from gyromodel.units import from_internal
@@ -44,7 +45,7 @@ def simulate(model: GyroModel, campaign: Campaign, seed: int = 0) -> Campaign:
     check_units(model, record.output_unit, record.units)
     model = model.prepared(record.signals)
     output = np.asarray(model.predict(record.signals))[: record.rows]
-    output = output + draw_noise(model, record, np.random.default_rng(seed))
+    output = output + draw_noise(model, with_stated_level(record, model), np.random.default_rng(seed))
     kind = campaign.metadata.get("kind", "rate")
     if kind != "rate":
         step = np.diff(campaign.si("time"))

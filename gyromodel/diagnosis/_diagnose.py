@@ -33,7 +33,7 @@ from gyromodel.diagnosis._session import (
 )
 from gyromodel.diagnosis._shapes import driver_shape, minimum_detectable, not_testable
 from gyromodel.diagnosis._steps import Found
-from gyromodel.diagnosis._variance import follow, growing_noise, noise_level, tails
+from gyromodel.diagnosis._variance import Growth, follow, growing_noise, noise_level, tails
 from gyromodel.diagnosis._verdict import FAINT, judge, structured, with_noise, with_steps
 from gyromodel.estimate import (
     Estimate,
@@ -45,7 +45,8 @@ from gyromodel.estimate import (
     with_noise_intervals,
     with_reading,
 )
-from gyromodel.model import GyroModel
+from gyromodel.model import GyroModel, Level
+from gyromodel.noise_level import with_level, with_stated_level
 from gyromodel.signals import with_columns_known
 from gyromodel.units import factor, from_internal
 
@@ -97,6 +98,7 @@ def diagnose(
     check_covariates(record, model)
     _refuse_missing(measured, data, model)
     record, left_out = with_columns_known(record)
+    record = with_stated_level(record, model)
     findings += left_out
     say("fitting the simulation", 0.02)
     readings, given = data.readings, model
@@ -187,6 +189,8 @@ def diagnose(
     scale = factor(record.input_unit, unit)
     ordinary = tuple(hold_out and session.ladder(e)[2] for e in (baseline, selection.estimate))
     extended = _finished(selection.estimate, ordinary[1])
+    if grows and (level := grows.level(record)):
+        extended = _following(extended, grows, level)
     weights = ordinary[0], extended.ordinary
     extended = readings.widened(as_it_was, extended, rounding)
     if extended.ordinary:
@@ -321,6 +325,16 @@ def _finished(estimate: Estimate, ordinary: bool) -> Estimate:
         with contextlib.suppress(EstimateError):
             estimate = fit_record(estimate.record, estimate.model_as_given(), ordinary=True)
     return with_noise_intervals(estimate)
+
+
+def _following(estimate: Estimate, grows: Growth, level: Level) -> Estimate:
+    """The fit with what its noise level follows as its model states it."""
+    model = with_level(estimate.model, grows.ratio, level)
+    if model is estimate.model:
+        return estimate
+    ratio, spread = float(model.noise["noise_heteroscedastic"]), np.exp(1.96 * grows.ratio_std / grows.ratio)
+    interval = {**estimate.noise_interval, "noise_heteroscedastic": (ratio / spread, ratio * spread)}
+    return replace(estimate, model=model, noise_interval=interval)
 
 
 def _with_noise_estimated(estimate: Estimate) -> Estimate | None:

@@ -22,6 +22,7 @@ from gyromodel.effects._base import evaluate
 from gyromodel.estimate import Estimate, as_read, filter_of, given_ratios, step_of, whiten_columns
 from gyromodel.model import GyroModel, ModelError, effect_class, make_effect, parameter_unit
 from gyromodel.noise import NoiseRatios
+from gyromodel.noise_level import with_stated_level
 from gyromodel.signals import Record, read_signals, with_columns_known
 from gyromodel.units import factor, internal_unit
 
@@ -128,7 +129,7 @@ def settling_test(
     truths = _at_size(View(extended.record, without, extended.ratios, std), extended.model, names)
 
     def distance(*more: Campaign) -> tuple[float, str, str]:
-        record = with_columns_known(read_signals([*campaigns, *more]))[0]
+        record = with_stated_level(with_columns_known(read_signals([*campaigns, *more]))[0], extended.model)
         return nearest(View(record, without, extended.ratios, std), truths)
 
     now = distance()[0]
@@ -264,7 +265,7 @@ def _sizes(
     campaigns: Sequence[Campaign], model: GyroModel
 ) -> tuple[dict[str, Size], dict[tuple[str, str], Size], dict[str, str]]:
     """Sizes that are found, sizes that are told apart, and what is not testable."""
-    record = with_columns_known(read_signals(campaigns))[0]
+    record = with_stated_level(with_columns_known(read_signals(campaigns))[0], model)
     model = model.prepared(record.signals)
     model = as_read(model, record, step_of(model, record))
     ratios = given_ratios(record, model)

@@ -12,6 +12,8 @@ from gyromodel._checks import thermometers
 from gyromodel.campaign import Campaign
 from gyromodel.declarations import RATE_OF
 from gyromodel.estimate import Estimate
+from gyromodel.model import Level
+from gyromodel.noise_level import FORMS
 from gyromodel.numerics.rounding import quantum
 from gyromodel.signals import Record
 
@@ -32,17 +34,15 @@ FEWEST_REPEATS, CHANCE, MOST_REPEATS = 4, 1e-4, 0.5
 JUMP = 2.0
 
 
+LABELS = {"rate": "|rate|", "temperature": "temperature", "temperature_rate": "|temperature rate|", "time": "time"}
+
+
 def variance_drivers(record: Record) -> dict[str, np.ndarray]:
     """What the noise may grow with, each scaled to 0…1."""
     found = {}
-    for label, name, form in (
-        ("|rate|", "rate", np.abs),
-        ("temperature", "temperature", np.asarray),
-        ("|temperature rate|", "temperature_rate", np.abs),
-        ("time", "time", np.asarray),
-    ):
+    for name, label in LABELS.items():
         if name in record.signals:
-            values = form(np.asarray(record.signals[name]))
+            values = FORMS[name](np.asarray(record.signals[name]))
             inside = values[: record.rows]
             if np.isfinite(inside).all() and np.ptp(inside) > 0:
                 found[label] = (values - inside.min()) / np.ptp(inside)
@@ -71,6 +71,14 @@ class Growth(NamedTuple):
         """What the driver is made of."""
         return RATE_OF.format("temperature") if "temperature rate" in self.driver else self.driver.strip("|")
 
+    def level(self, record: Record) -> Level | None:
+        """What a model states of it: the driver over the record's range; an interval of samples none can."""
+        name = next((name for name, label in LABELS.items() if label == self.driver), None)
+        if name is None:
+            return None
+        values = FORMS[name](np.asarray(record.signals[name])[: record.rows])
+        return Level(name, float(values.min()), float(values.max()))
+
 
 def growing_noise(record: Record, estimate: Estimate) -> Growth | None:
     """The driver that the noise level follows most; None where it follows none."""
@@ -89,7 +97,7 @@ def growing_noise(record: Record, estimate: Estimate) -> Growth | None:
         return None
     x = best[2][: record.rows][use]
     slope = _log_slope(x, estimate.whitened[use] ** 2)
-    white = np.exp(slope * (np.clip(best[2], 0.0, 1.0) - x.mean()))
+    white = np.exp(slope * (np.clip(best[2], 0.0, 1.0) - 0.5))
     ratio = float(np.exp(0.5 * slope))
     std = ratio * float(np.sqrt(0.5 / np.sum((x - x.mean()) ** 2)))
     evidence = 0.5 * (best[0] - np.log(len(e))) - np.log(len(drivers))

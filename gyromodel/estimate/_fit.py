@@ -22,6 +22,7 @@ from gyromodel.estimate._rounding import fit_readings, with_step_of
 from gyromodel.estimate._whitening import filter_of, pad_columns, whiten_columns
 from gyromodel.model import GyroModel, ModelError, check_domain, check_units
 from gyromodel.noise import NoiseRatios, from_grams, stated_ratios
+from gyromodel.noise_level import with_stated_level
 from gyromodel.numerics.least_squares import Normal, Solution, levenberg_marquardt
 from gyromodel.numerics.state_space import Filter, colour, whitened_gram
 from gyromodel.numerics.uncertain import Source
@@ -65,7 +66,7 @@ def fit(
     given = [campaigns] if isinstance(campaigns, Campaign) else campaigns
     record = read_for_fit(given)
     refuse_apart(given, model)
-    model = with_step_of(model, given)
+    model, record = with_step_of(model, given), with_stated_level(record, model)
     if progress:
         progress("fitting", 0.1)
     estimate = with_noise_intervals(fit_record(record, model, solver=solver))

@@ -16,6 +16,7 @@ from gyromodel.estimate._blocks import BLOCK, Blocks, gram_of, in_turn
 from gyromodel.estimate._fit import check_enough, given_ratios
 from gyromodel.model import GyroModel, ModelError, check_units
 from gyromodel.noise import NoiseRatios, markov_sum
+from gyromodel.noise_level import with_stated_level
 from gyromodel.numerics.compiled_least_squares import Search, search_minimum
 from gyromodel.numerics.state_space import Sampling, build_filter
 from gyromodel.signals import Record
@@ -72,7 +73,7 @@ def ready(place: int, record: Record, given: Prepared) -> Waiting:
     model = GyroModel.prepared(given.model, record.signals)
     prepared = given if model is given.model else described(model)
     check_enough(record, len(prepared.start))
-    ratios = given_ratios(record, model)
+    record, ratios = with_stated_level(record, model), given_ratios(record, model)
     coloured = ratios is not None and any(float(r) > 0 for r in (*ratios[:3], *ratios.each()[4:]))
     return Waiting(place, record, model, prepared.start, prepared.structure, ratios if coloured else None)
 

@@ -15,6 +15,7 @@ from gyromodel import __version__
 from gyromodel._checks import usual_unit
 from gyromodel.effects.drivers import BiasColumn
 from gyromodel.estimate import Calibration, validity_unit
+from gyromodel.model import LEVEL_UNITS
 from gyromodel.model_files import SETTING_UNITS, parameter_names
 from gyromodel.noise import MARKOV_TIME, noise_units
 from gyromodel.units import factor, from_internal, internal_unit
@@ -79,6 +80,11 @@ def _noise(calibration: Calibration) -> list[Entry]:
         effect, what = ("noise_markov", "time_constant") if name == MARKOV_TIME else (name, "value")
         unit = noise_units(calibration.model.noise_of)[name]
         found.append(Entry(effect, "noise", what, float(from_internal(x, unit)), math.nan, unit, float(x)))
+    if (level := calibration.model.level) is not None:
+        unit = LEVEL_UNITS[level.driver]
+        for end, x in (("from", level.low), ("to", level.high)):
+            what, value = f"{level.driver} {end}", float(from_internal(x, unit))
+            found.append(Entry("noise_heteroscedastic", "noise", what, value, math.nan, unit, x))
     return found
 
 

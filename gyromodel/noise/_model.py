@@ -20,7 +20,14 @@ MARKOV_TIME = "noise_markov_time"
 # What a model can state of its noise, by public id, and the units it is written in.
 NOISE_UNITS = {
     name: NOISE[name].unit
-    for name in ("noise_white", "noise_flicker", "noise_random_walk", "noise_markov", "noise_quantisation")
+    for name in (
+        "noise_white",
+        "noise_flicker",
+        "noise_random_walk",
+        "noise_markov",
+        "noise_quantisation",
+        "noise_heteroscedastic",
+    )
 } | {MARKOV_TIME: "s"}
 
 # The same of an angle, such as that of a platform's base.
@@ -154,6 +161,8 @@ def check_stated(noise: Mapping[str, Any]) -> None:
     """Refuse (ValueError) a statement without white noise, or of Markov noise without its time or beside flicker."""
     if float(noise.get("noise_white", 0.0)) <= 0:
         raise ValueError("noise needs a noise_white above zero")
+    if float(noise.get("noise_heteroscedastic", 1.0)) <= 0:
+        raise ValueError("noise_heteroscedastic is a ratio of noise levels, and above zero")
     if float(noise.get("noise_markov", 0.0)):
         if float(noise.get("noise_flicker", 0.0)):
             raise ValueError("noise_flicker and noise_markov cannot stand side by side; state one of them")

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from gyromodel.estimate import as_read, make_filter, step_of
 from gyromodel.model import ModelError
 from gyromodel.noise import NoiseRatios, markov_sum, stated_ratios
+from gyromodel.noise_level import with_stated_level
 from gyromodel.numerics.state_space import colour
 from gyromodel.signals import Record
 from gyromodel.study._instruments import Instrument, by_column
@@ -235,6 +236,7 @@ def _each_axis(mission: Mission, record: Record, rows: np.ndarray | None) -> tup
         if not model.noise:
             return None
         model = as_read(model, record, step_of(model, record))
+        sampling = with_stated_level(record, model).sampling
         try:
             ratios = stated_ratios(model.noise, record.interval)
         except ValueError as problem:
@@ -251,9 +253,10 @@ def _each_axis(mission: Mission, record: Record, rows: np.ndarray | None) -> tup
                 states = markov_sum(cell, record.interval, longest).variance
                 walked = float(states[0]) * np.asarray(mission.signals["time"])[: record.rows]
                 differences = 2.0 * float(cell.quantisation or 0.0) * mission.together**2
-                caused.append(white * (mission.together + walked + float(states[1:].sum()) + differences))
+                level = np.asarray(sampling.white)[: record.rows]
+                caused.append(white * (level * mission.together + walked + float(states[1:].sum()) + differences))
             else:
-                through = _through_noise(cell, record.interval, longest, record.sampling, jnp.asarray(rows[:, axis]))
+                through = _through_noise(cell, record.interval, longest, sampling, jnp.asarray(rows[:, axis]))
                 caused.append(white * np.asarray(through))
         found.append(np.stack([caused[0], *(c - caused[0] for c in caused[1:])]))
     return ["noise_white", *KINDS], found

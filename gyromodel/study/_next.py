@@ -16,6 +16,7 @@ from gyromodel.diagnosis import added_tests
 from gyromodel.effects import Effect
 from gyromodel.estimate import as_read, check_covariates, filter_of, given_ratios, step_of, whiten_columns
 from gyromodel.model import GyroModel, ModelError, check_units
+from gyromodel.noise_level import with_stated_level
 from gyromodel.signals import OFF, read_signals, with_columns_known
 from gyromodel.study._budget import Budget
 from gyromodel.study._instruments import Instrument, output_by_column
@@ -69,7 +70,7 @@ def information(
     if not model.noise:
         raise ModelError("what a test can tell depends on the noise: state noise_white and the rest in the model")
     averaged, together = average(with_known_output(campaign), LONGEST)
-    record = with_columns_known(read_signals(averaged))[0]
+    record = with_stated_level(with_columns_known(read_signals(averaged))[0], model)
     model = model.prepared(record.signals)
     check_covariates(record, model)
     check_units(model, record.output_unit, record.units)
@@ -78,7 +79,7 @@ def information(
     assert ratios is not None
     std = noise * float(model.noise["noise_white"]) / np.sqrt(record.interval) * abs(float(model.gain()))
     signals = record.signals
-    white, common = np.ones(len(record.sampling.present)), []
+    white, common = np.array(record.sampling.white), []
     for name, instrument in (instruments or {}).items():
         if name in signals:
             change = output_by_column(model, signals, name) / std

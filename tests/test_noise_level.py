@@ -1,0 +1,120 @@
+"""A noise level that follows a column: stated, simulated, fitted, found, and told by a calibration."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gyromodel as gm
+from gyromodel.compensation import compensate
+from gyromodel.estimate import fit_many
+from gyromodel.model import Level, ModelError
+from gyromodel.signals import read_signals
+
+ROWS, STEP, N = 1000, 5.0, np.deg2rad(0.3) / 60.0
+FILE = """effects: [{{effect: bias}}, {{effect: scale_factor, value: 1}}]
+noise:
+  - {{effect: noise_white, value: 0.3 deg/sqrt(h)}}
+  - {{effect: noise_heteroscedastic, {rest}}}
+"""
+
+
+def rates() -> np.ndarray:
+    return np.deg2rad(np.tile(np.linspace(-100.0, 100.0, 20), ROWS // 20))
+
+
+def relative(values: np.ndarray, ratio: float) -> np.ndarray:
+    """σ at rates over that at 50 deg/s, a straight line in ln σ."""
+    return np.exp(np.log(ratio) * (np.abs(values) / np.deg2rad(100.0) - 0.5))
+
+
+def campaign(rng: np.random.Generator, ratio: float) -> gm.Campaign:
+    """In rad/s, of a rate table, the noise drawn here."""
+    rate = rates()
+    noise = rng.standard_normal(ROWS) * N / np.sqrt(STEP) * relative(rate, ratio)
+    columns = {"time": np.arange(ROWS) * STEP, "rate": rate, "output": 1e-5 + rate + noise}
+    return gm.Campaign(columns, {"time": "s", "rate": "rad/s", "output": "rad/s"}, {"kind": "rate"})
+
+
+def stated(ratio: float, *effects: str) -> gm.GyroModel:
+    model = gm.model_from_effects(list(effects) or ["bias", "scale_factor"])
+    noise = {"noise_white": N, "noise_heteroscedastic": ratio}
+    return replace(model, noise=noise, level=Level("rate", 0.0, np.deg2rad(100.0)))
+
+
+def test_weights_are_those_of_least_squares_by_hand(rng: np.random.Generator):
+    measured = campaign(rng, 6.0)
+    estimate = gm.fit(measured, stated(6.0))
+    weight = 1.0 / relative(rates(), 6.0)
+    columns = np.column_stack([np.ones(ROWS), rates()]) * weight[:, None]
+    by_hand, *_ = np.linalg.lstsq(columns, measured.columns["output"] * weight, rcond=None)
+    # The output is scale · (rate + bias).
+    bias, scale = by_hand[0] / by_hand[1], by_hand[1]
+    assert np.asarray(estimate.model.vector()) == pytest.approx([bias, scale], rel=1e-6)
+    left = (measured.columns["output"] * weight - columns @ by_hand) ** 2
+    spread = np.sqrt(np.linalg.inv(columns.T @ columns)[1, 1] * left.sum() / (ROWS - 2))
+    assert estimate.std[1] == pytest.approx(spread, rel=1e-6)
+    many = fit_many([read_signals([measured])], stated(6.0))
+    assert many.values[0] == pytest.approx(np.asarray(estimate.model.vector()), rel=1e-9)
+
+
+def test_a_file_says_what_it_follows_and_simulates_it(tmp_path: Path, rng: np.random.Generator):
+    path = tmp_path / "model.yaml"
+    path.write_text(FILE.format(rest="value: 4, driver: rate, from: 0 deg/s, to: 100 deg/s"))
+    model = gm.read_model(path)
+    gm.write_model(model, path)
+    assert gm.read_model(path).level == model.level == Level("rate", 0.0, np.deg2rad(100.0))
+    model = model.with_vector(np.array([0.0, 1.0]))
+    drawn = [gm.simulate(model, campaign(rng, 1.0), seed=int(s)) for s in rng.integers(2**31, size=20)]
+    error = np.concatenate([d.columns["output"] - rates() for d in drawn])
+    found, expected = error / (N / np.sqrt(STEP)), np.tile(relative(rates(), 4.0), 20)
+    for level in np.unique(np.round(expected, 9)):
+        here = np.isclose(expected, level)
+        assert np.std(found[here]) == pytest.approx(level, rel=5.0 / np.sqrt(2.0 * here.sum()))
+
+
+@pytest.mark.parametrize(
+    ("rest", "said"),
+    [
+        ("value: 4", "needs driver"),
+        ("value: 4, driver: pressure, from: 0 hPa, to: 1 hPa", "follows one of rate, temperature"),
+        ("value: 4, driver: rate, from: 5 deg/s, to: 5 deg/s", "to a larger one"),
+        ("value: 4, driver: rate, from: 0 degC, to: 5 deg/s", "is not in deg/s"),
+        ("value: 0, driver: rate, from: 0 deg/s, to: 5 deg/s", "above zero"),
+    ],
+)
+def test_what_it_follows_must_be_said_whole(rest: str, said: str, tmp_path: Path):
+    path = tmp_path / "model.yaml"
+    path.write_text(FILE.format(rest=rest))
+    with pytest.raises(ModelError, match=said):
+        gm.read_model(path)
+
+
+def test_a_campaign_without_the_column_is_refused(rng: np.random.Generator):
+    measured = campaign(rng, 2.0)
+    model = replace(stated(2.0), level=Level("temperature", 0.0, 40.0))
+    with pytest.raises(ModelError, match="noise_heteroscedastic follows temperature, which the campaign lacks"):
+        gm.fit(measured, model)
+
+
+@pytest.mark.law
+def test_the_extended_model_states_what_was_found_and_is_adequate(tmp_path: Path, rng: np.random.Generator):
+    first = gm.diagnose(campaign(rng, 4.0), gm.model_from_effects(["bias", "scale_factor"]), hold_out=False)
+    assert first.verdict == "adequate"
+    gm.write_model(first.extended, tmp_path / "extended.yaml")
+    extended = gm.read_model(tmp_path / "extended.yaml")
+    assert float(extended.noise["noise_heteroscedastic"]) == pytest.approx(4.0, rel=0.35)
+    assert gm.diagnose(campaign(rng, 4.0), extended, hold_out=False).verdict == "adequate"
+    # One that is not as in the data is told of.
+    steady = replace(extended, noise={k: v for k, v in extended.noise.items() if "hetero" not in k}, level=None)
+    assert gm.diagnose(campaign(rng, 4.0), steady, hold_out=False).causes[0].effect == "noise_heteroscedastic"
+
+
+def test_a_calibration_tells_the_scatter_at_the_rate_it_finds(rng: np.random.Generator):
+    estimate = gm.fit(campaign(rng, 5.0), stated(5.0))
+    calibration = estimate.calibration()
+    told = np.deg2rad(compensate(campaign(rng, 5.0).without("rate"), calibration).columns["rate_estimated_std"])
+    assert told == pytest.approx(N / np.sqrt(STEP) * relative(rates(), 5.0), rel=0.02)
