@@ -93,12 +93,13 @@ NOISE = {
             "Read the angle in finer steps: what falls with them is quantisation.",
         ),
         NoiseKind(
-            "noise_telegraph", "deg/h", 0.1, "–", "–", "hops of the bias between two levels; not stated",
+            "noise_telegraph", "deg/h", 0.1, "–", "–",
+            "hops of the bias between two levels, stated with their mean times time_low and time_high",
             "A laser hops between two modes, or a component has popcorn noise.",
             "Log the laser current beside: hops of modes come with it; what switches nearby keeps a regular pace.",
         ),
         NoiseKind(
-            "noise_heteroscedastic", "1", 2.0, "–", "–", "level at one end of rate, temperature, its rate or time over that at the other",
+            "noise_heteroscedastic", "1", 2.0, "–", "–", "σ at one end of what it follows over σ at the other",
             "Its source grows with the rate (a table's motion) or with the temperature (less light, more current).",
             "Log at rest at several temperatures, and at several rates at one temperature.",
         ),

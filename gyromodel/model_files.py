@@ -21,7 +21,7 @@ from gyromodel.effects.scale import ScaleTemperatureCurve
 from gyromodel.effects.thermal import BiasTemperatureCurve
 from gyromodel.estimate import Calibration, Estimate, validity_unit
 from gyromodel.model import LEVEL_UNITS, GyroModel, Level, ModelError, make_effect, parameter_unit
-from gyromodel.noise import MARKOV_TIME, NOISE_UNITS, check_stated, noise_units
+from gyromodel.noise import NOISE_UNITS, TIMES, check_stated, noise_units
 from gyromodel.numerics.uncertain import Source, Uncertain
 from gyromodel.signals import Record
 from gyromodel.units import convertible, from_internal, internal_unit
@@ -253,12 +253,13 @@ def _read_noise(place: Place, of: list[Domain]) -> tuple[dict[str, float], Domai
     noise: dict[str, float] = {}
     level = None
     for item in place.items("noise"):
-        keys = ("effect", "value", "lo", "hi", "time_constant", *LEVEL_KEYS)
+        times = dict.fromkeys(what for _, what in TIMES.values())
+        keys = ("effect", "value", "lo", "hi", *times, *LEVEL_KEYS)
         entry = item.mapping(keys, "a noise entry")
         if "effect" not in entry or "value" not in entry:
             raise item.error("each noise entry needs an effect: id and a value")
         name = entry["effect"].text()
-        known = [k for k in NOISE_UNITS if k != MARKOV_TIME]
+        known = [k for k in NOISE_UNITS if k not in TIMES]
         if name not in known:
             raise entry["effect"].error(f"unknown noise {name}; known are {', '.join(known)}")
         if name in noise:
@@ -270,10 +271,11 @@ def _read_noise(place: Place, of: list[Domain]) -> tuple[dict[str, float], Domai
         of = [d for d in of if convertible(entry["value"].quantity()[1], noise_units(d)[name])]
         if noise[name] < 0:
             raise entry["value"].error(f"{name} cannot be negative")
-        if "time_constant" in entry:
-            if name != "noise_markov":
-                raise entry["time_constant"].error(f"{name} has no time_constant")
-            noise[MARKOV_TIME] = entry["time_constant"].number_in(NOISE_UNITS[MARKOV_TIME])
+        for key in (key for key in times if key in entry):
+            of_kind = next((k for k, what in TIMES.items() if what == (name, key)), None)
+            if of_kind is None:
+                raise entry[key].error(f"{name} has no {key}")
+            noise[of_kind] = entry[key].number_in(NOISE_UNITS[of_kind])
         if name == "noise_heteroscedastic":
             level = _read_level(item, entry)
         elif extra := next((key for key in LEVEL_KEYS if key in entry), None):
@@ -345,8 +347,9 @@ def _document(model: GyroModel, estimate: Estimate | None) -> dict[str, Any]:
         texts = [driver, *(exact_text(end, LEVEL_UNITS[driver]) for end in ends)]
         ratio = float(model.noise["noise_heteroscedastic"])
         noise["noise_heteroscedastic"] |= {"value": ratio, **dict(zip(LEVEL_KEYS, texts, strict=True))}
-    if MARKOV_TIME in noise:
-        noise["noise_markov"]["time_constant"] = noise.pop(MARKOV_TIME)["value"]
+    for name in TIMES.keys() & noise.keys():
+        kind, what = TIMES[name]
+        noise[kind][what] = noise.pop(name)["value"]
     document["noise"] = list(noise.values()) or "auto"
     if estimate and record:
         document["fit"] = _fit_record(estimate)

@@ -10,7 +10,7 @@ from gyromodel._checks import CampaignError
 from gyromodel.campaign import Campaign
 from gyromodel.effects.converter import Quantisation
 from gyromodel.model import GyroModel, ModelError, check_reading, check_units
-from gyromodel.noise import NoiseRatios, markov_sum, stated_ratios
+from gyromodel.noise import TELEGRAPH_TIMES, NoiseRatios, check_stated, markov_sum, stated_ratios
 from gyromodel.noise_level import with_stated_level
 from gyromodel.numerics.state_space import build_filter, colour
 from gyromodel.signals import Record, read_signals
@@ -70,8 +70,11 @@ def draw_noise(model: GyroModel, record: Record, rng: np.random.Generator) -> np
     """One draw of the model's noise in output units, through the same state-space form that whitens it."""
     if not model.noise:
         return np.zeros(record.rows)
+    hopping = "noise_telegraph" in model.noise
     try:
-        ratios = stated_ratios(model.noise, record.interval)
+        check_stated(model.noise)
+        beside = {name: value for name, value in model.noise.items() if not name.startswith("noise_telegraph")}
+        ratios = stated_ratios(beside, record.interval)
     except ValueError as problem:
         raise ModelError(str(problem)) from None
     variance = float(model.noise["noise_white"]) ** 2 / record.interval
@@ -79,7 +82,28 @@ def draw_noise(model: GyroModel, record: Record, rng: np.random.Generator) -> np
     sampling = record.sampling._replace(present=jnp.ones_like(record.sampling.present))
     longest = float(ratios.longest(record.span))
     noise = _realise(ratios, record.interval, longest, sampling, draws)
-    return np.asarray(noise)[: record.rows] * np.sqrt(variance) * abs(float(model.gain()))
+    rate = np.asarray(noise)[: record.rows] * np.sqrt(variance)
+    if hopping:
+        low, high = (float(model.noise[name]) for name in TELEGRAPH_TIMES)
+        rate += _hops(record, float(model.noise["noise_telegraph"]), low, high, rng)
+    return rate * abs(float(model.gain()))
+
+
+def _hops(record: Record, size: float, low: float, high: float, rng: np.random.Generator) -> np.ndarray:
+    """A bias that hops between two levels `size` apart, of mean zero, each held for an exponential time of its mean.
+
+    Each run begins in either.
+    """
+    time, share = np.asarray(record.signals["time"])[: record.rows], high / (low + high)
+    hops = np.empty(record.rows)
+    for run in np.split(np.arange(record.rows), np.flatnonzero(np.diff(record.run[: record.rows])) + 1):
+        upper, ends, values = bool(rng.random() < share), [time[run[0]]], []
+        while ends[-1] <= time[run[-1]]:
+            values.append(upper - share)
+            ends.append(ends[-1] + rng.exponential(high if upper else low))
+            upper = not upper
+        hops[run] = np.array(values)[np.searchsorted(ends, time[run], side="right") - 1]
+    return size * hops
 
 
 @jax.jit

@@ -30,14 +30,9 @@ def temperature() -> np.ndarray:
 
 
 def counted(rng: np.random.Generator, slope: float = 0.0) -> gm.Campaign:
-    """A log at rest of a counted angle; `slope` in deg/h per degC.
-
-    The gyro is shaken, so that rounding is at random, and what it was shaken by is taken from the counts.
-    """
+    """A log at rest of a counted angle; `slope` in deg/h per degC."""
     rate = (8.0 + slope * (temperature() - 25.0)) * DEG_H + truth.white(ROWS, STEP, N, rng)
-    angle, shaken = np.cumsum(rate) * STEP, rng.uniform(-50.0, 50.0, ROWS) * COUNT
-    read = np.round((angle + shaken) / COUNT) * COUNT - shaken
-    return log(np.diff(read, prepend=0.0) / STEP)
+    return log(truth.shaken(rate, STEP, COUNT, rng))
 
 
 def log(output: np.ndarray) -> gm.Campaign:

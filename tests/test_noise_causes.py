@@ -1,6 +1,9 @@
-"""Noise of kinds that a fit cannot hold, each against a simulator of its own (tests/truth/noise.py)."""
+"""Noise that is no colour, each against a simulator of its own (tests/truth/noise.py)."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ import gyromodel as gm
 from gyromodel.diagnosis import _noise_causes
 from gyromodel.diagnosis._noise_causes import quantisation, telegraph
 from gyromodel.estimate import Estimate
+from gyromodel.model import ModelError
 from tests.truth import noise as truth
 from tests.truth import study
 from tests.truth.designs import Design
@@ -197,3 +201,64 @@ def test_a_ripple_at_one_end_of_a_column_is_told_beside_the_noise(rng: np.random
     assert all(grows == follow for *_, grows, follow in ripples)
     assert any(grows for *_, grows, _ in ripples)
     assert told(rng.standard_normal(ROWS)) == ("adequate", None, True, False)
+
+
+HOPS = {"noise_telegraph": 3.0 * WHITE / np.sqrt(STEP), "noise_telegraph_low": 1600.0, "noise_telegraph_high": 1000.0}
+
+
+def hopping(rng: np.random.Generator) -> gm.Campaign:
+    return log(white(rng) + truth.telegraph(ROWS, STEP, *HOPS.values(), rng))
+
+
+def test_stated_hops_are_simulated_and_fitted_as_what_has_their_correlation(tmp_path: Path, rng: np.random.Generator):
+    """Variance p (1 - p) size², which decays as exp(-t/T), 1/T = 1/t_low + 1/t_high, of draws and in fits."""
+    model = replace(gm.model_from_effects(["bias"]), noise={"noise_white": WHITE, **HOPS}).with_vector(np.array([1e-6]))
+    gm.write_model(model, tmp_path / "model.yaml")
+    again = gm.read_model(tmp_path / "model.yaml")
+    assert {k: float(v) for k, v in again.noise.items()} == pytest.approx({"noise_white": WHITE, **HOPS})
+    size, low, high = HOPS.values()
+    variance, time = size**2 * low * high / (low + high) ** 2, low * high / (low + high)
+    draws = [gm.simulate(again, hopping(rng), seed=int(s)).columns["output"] for s in rng.integers(2**31, size=400)]
+    left = np.array(draws) - 1e-6
+    for lag in (10, 50):
+        found = np.mean(left[:, lag:] * left[:, :-lag], axis=1)
+        expected = variance * np.exp(-lag * STEP / time)
+        assert abs(found.mean() - expected) < 4.0 * found.std() / np.sqrt(len(found))
+    apart = STEP * np.abs(np.subtract.outer(np.arange(ROWS), np.arange(ROWS)))
+    dense = variance * np.exp(-apart / time) + WHITE**2 / STEP * np.eye(ROWS)
+    estimate = gm.fit(log(left[0]), again)
+    scale = estimate.white_variance / (WHITE**2 / STEP)
+    assert estimate.std[0] == pytest.approx(np.sqrt(scale / np.linalg.inv(dense).sum()), rel=1e-6)
+
+
+@pytest.mark.law
+@pytest.mark.long
+def test_an_extended_model_states_hops_that_were_found(tmp_path: Path, rng: np.random.Generator):
+    right, tried = 0, 5
+    for _ in range(tried):
+        first = gm.diagnose(hopping(rng), gm.model_from_effects(["bias"]), hold_out=False)
+        gm.write_model(first.extended, tmp_path / "extended.yaml")
+        extended = gm.read_model(tmp_path / "extended.yaml")
+        right += "noise_telegraph" in extended.noise and (
+            gm.diagnose(hopping(rng), extended, hold_out=False).verdict == "adequate"
+        )
+    assert binom.cdf(right, tried, 0.9) > RARE
+
+
+@pytest.mark.parametrize(
+    ("rest", "said"),
+    [
+        ("value: 1 deg/h", "needs a time_low and a time_high"),
+        ("value: 1 deg/h, time_low: 3 s, time_high: 4 s, time_constant: 5 s", "has no time_constant"),
+        ("value: 1 deg/h, time_low: 3 s, time_high: 4 s}\n  - {effect: noise_flicker, value: 1 deg/h", "cannot stand"),
+            "value: 1 deg/h, time_low: 3 s, time_high: 4 s}\n  - {effect: noise_flicker, value: 1 deg/h",
+            "cannot stand beside",
+        ),
+    ],
+)
+def test_hops_are_stated_with_their_times_and_without_flicker(rest: str, said: str, tmp_path: Path):
+    path = tmp_path / "model.yaml"
+    noise = f"  - {{effect: noise_white, value: 1 deg/sqrt(h)}}\n  - {{effect: noise_telegraph, {rest}}}"
+    path.write_text(f"effects: [{{effect: bias}}]\nnoise:\n{noise}\n")
+    with pytest.raises(ModelError, match=said):
+        gm.read_model(path)

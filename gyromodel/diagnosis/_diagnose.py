@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
 
+import jax.numpy as jnp
 import numpy as np
 
 from gyromodel._checks import listed
@@ -46,13 +47,16 @@ from gyromodel.estimate import (
     with_reading,
 )
 from gyromodel.model import GyroModel, Level
+from gyromodel.noise import MARKOV_TIME, TELEGRAPH_TIMES
 from gyromodel.noise_level import with_level, with_stated_level
 from gyromodel.signals import with_columns_known
-from gyromodel.units import factor, from_internal
+from gyromodel.units import factor, from_internal, internal_unit
 
 FEWEST_DRAWS = 200
 # Searches beside rounding as it is at what the last has found.
 ROUNDINGS = 3
+# What fits take hops of the bias for.
+STANDS_FOR_HOPS = ("noise_flicker", "noise_markov", MARKOV_TIME)
 # Folds search the noise cells within this many nats of the best of the main pass.
 FOLD_NEARBY = 3.0
 SMOOTHED = (
@@ -164,10 +168,11 @@ def diagnose(
             )
     as_it_was, record, baseline = record, session.record, session.baseline
     free = _with_noise_estimated(selection.estimate)
-    hops = telegraph(baseline, free, unit) if free and record.domain == "gyro" and _like_hops(selection, free) else None
+    sought = record.domain == "gyro" and "noise_telegraph" not in model.noise
+    hops = telegraph(baseline, free, unit) if free and sought and _like_hops(selection, free) else None
     if hops is not None:
         beyond.append(hops)
-        findings.append("No fit holds hops of the bias: the extended model takes them for noise of the kinds it holds.")
+        findings.append("Fits take hops of the bias for noise of a like variance and correlation.")
         first = selection.path[0].ranking if selection.path else selection.last
         start = _with_noise_estimated(baseline) or baseline
         selection = Selection(start, (), (), first, (start,), None)
@@ -191,6 +196,8 @@ def diagnose(
     extended = _finished(selection.estimate, ordinary[1])
     if grows and (level := grows.level(record)):
         extended = _following(extended, grows, level)
+    if hops is not None:
+        extended = _hopping(extended, hops)
     weights = ordinary[0], extended.ordinary
     extended = readings.widened(as_it_was, extended, rounding)
     if extended.ordinary:
@@ -325,6 +332,15 @@ def _finished(estimate: Estimate, ordinary: bool) -> Estimate:
         with contextlib.suppress(EstimateError):
             estimate = fit_record(estimate.record, estimate.model_as_given(), ordinary=True)
     return with_noise_intervals(estimate)
+
+
+def _hopping(estimate: Estimate, hops: Cause) -> Estimate:
+    """The fit with hops of the bias as its model states them, in the place of the noise that stood for them."""
+    kept = {name: v for name, v in estimate.model.noise.items() if name not in (*STANDS_FOR_HOPS, *TELEGRAPH_TIMES)}
+    names = ("noise_telegraph", *TELEGRAPH_TIMES)
+    values = [p.value * factor(p.unit, internal_unit(p.unit)) for p in hops.parameters]
+    noise = kept | {name: jnp.asarray(value) for name, value in zip(names, values, strict=True)}
+    return replace(estimate, model=replace(estimate.model, noise=noise))
 
 
 def _following(estimate: Estimate, grows: Growth, level: Level) -> Estimate:

@@ -17,7 +17,7 @@ from gyromodel.effects.drivers import BiasColumn
 from gyromodel.estimate import Calibration, validity_unit
 from gyromodel.model import LEVEL_UNITS
 from gyromodel.model_files import SETTING_UNITS, parameter_names
-from gyromodel.noise import MARKOV_TIME, noise_units
+from gyromodel.noise import TIMES, noise_units
 from gyromodel.units import factor, from_internal, internal_unit
 
 FORMULA = (
@@ -77,7 +77,7 @@ def column_unit(effect: BiasColumn) -> str:
 def _noise(calibration: Calibration) -> list[Entry]:
     found = []
     for name, x in calibration.model.noise.items():
-        effect, what = ("noise_markov", "time_constant") if name == MARKOV_TIME else (name, "value")
+        effect, what = TIMES.get(name, (name, "value"))
         unit = noise_units(calibration.model.noise_of)[name]
         found.append(Entry(effect, "noise", what, float(from_internal(x, unit)), math.nan, unit, float(x)))
     if (level := calibration.model.level) is not None:

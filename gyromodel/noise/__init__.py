@@ -8,6 +8,8 @@ from gyromodel.noise._likelihood import CellFit, from_grams, gram_by_cell, restr
 from gyromodel.noise._model import (
     MARKOV_TIME,
     NOISE_UNITS,
+    TELEGRAPH_TIMES,
+    TIMES,
     NoiseGrid,
     NoiseRatios,
     check_stated,
@@ -23,6 +25,8 @@ from gyromodel.noise._terms import NoiseTerm
 __all__ = [
     "MARKOV_TIME",
     "NOISE_UNITS",
+    "TELEGRAPH_TIMES",
+    "TIMES",
     "CellFit",
     "Deviation",
     "Estimator",

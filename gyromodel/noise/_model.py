@@ -17,6 +17,13 @@ from gyromodel.declarations import NOISE
 from gyromodel.numerics.state_space import MarkovSum
 
 MARKOV_TIME = "noise_markov_time"
+TELEGRAPH_TIMES = ("noise_telegraph_low", "noise_telegraph_high")
+# Times that belong to a kind: its id, and what a model file calls them.
+TIMES = {
+    MARKOV_TIME: ("noise_markov", "time_constant"),
+    TELEGRAPH_TIMES[0]: ("noise_telegraph", "time_low"),
+    TELEGRAPH_TIMES[1]: ("noise_telegraph", "time_high"),
+}
 # What a model can state of its noise, by public id, and the units it is written in.
 NOISE_UNITS = {
     name: NOISE[name].unit
@@ -27,8 +34,9 @@ NOISE_UNITS = {
         "noise_markov",
         "noise_quantisation",
         "noise_heteroscedastic",
+        "noise_telegraph",
     )
-} | {MARKOV_TIME: "s"}
+} | dict.fromkeys(TIMES, "s")
 
 # The same of an angle, such as that of a platform's base.
 ANGLE_NOISE_UNITS = {
@@ -168,15 +176,27 @@ def check_stated(noise: Mapping[str, Any]) -> None:
             raise ValueError("noise_flicker and noise_markov cannot stand side by side; state one of them")
         if float(noise.get(MARKOV_TIME, 0.0)) <= 0:
             raise ValueError("noise_markov needs a time_constant above zero")
+    if float(noise.get("noise_telegraph", 0.0)):
+        if float(noise.get("noise_flicker", 0.0)) or float(noise.get("noise_markov", 0.0)):
+            raise ValueError("noise_telegraph cannot stand beside noise_flicker or noise_markov; state one of them")
+        if not all(float(noise.get(name, 0.0)) > 0 for name in TELEGRAPH_TIMES):
+            raise ValueError("noise_telegraph needs a time_low and a time_high above zero")
 
 
 def stated_ratios(noise: Mapping[str, Any], interval: float) -> NoiseRatios:
-    """The cell of stated coefficients (internal units): the inverse of `coefficients`, after `check_stated`."""
+    """The cell of stated coefficients (internal units): the inverse of `coefficients`, after `check_stated`.
+
+    Hops between two levels have the variance and the correlation of a Markov process, which stands for them.
+    """
     check_stated(noise)
     stated = {name: float(value) for name, value in noise.items()}
     variance = stated["noise_white"] ** 2 / interval
     flicker, walk = stated.get("noise_flicker", 0.0), stated.get("noise_random_walk", 0.0)
     q, constant = stated.get("noise_markov", 0.0), stated.get(MARKOV_TIME, 0.0)
-    ratios = (flicker**2 / variance, walk**2 * interval / variance, q**2 * constant / 2.0 / variance, constant)
+    level = q**2 * constant / 2.0
+    if size := stated.get("noise_telegraph", 0.0):
+        low, high = (stated[name] for name in TELEGRAPH_TIMES)
+        level, constant = size**2 * low * high / (low + high) ** 2, low * high / (low + high)
+    ratios = (flicker**2 / variance, walk**2 * interval / variance, level / variance, constant)
     angle = stated.get("noise_quantisation", 0.0)
     return NoiseRatios(*(jnp.asarray(r) for r in (*ratios, *[angle**2 / interval**2 / variance] * (angle > 0))))

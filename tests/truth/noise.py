@@ -81,6 +81,15 @@ def quantised(rate: Array, step: float, lsb: float) -> Array:
     return np.diff(np.round(angle / lsb) * lsb) / step
 
 
+def shaken(rate: Array, step: float, lsb: float, rng: np.random.Generator) -> Array:
+    """As `quantised`, of a gyro that is shaken by many steps, so that it is rounded at random.
+
+    What it was shaken by is taken from the counts, as a dither's pickoff does.
+    """
+    angle, motion = np.cumsum(rate * step), rng.uniform(-50.0, 50.0, len(rate)) * lsb
+    return np.diff(np.round((angle + motion) / lsb) * lsb - motion, prepend=0.0) / step
+
+
 @dataclass(frozen=True)
 class Noise:
     """One noise law: white plus coloured terms; SI units (rad/s).
