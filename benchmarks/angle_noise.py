@@ -119,14 +119,14 @@ def main(argv: list[str] | None = None) -> None:
     ]
     lines = [
         f"Logs at rest of a shaken gyro whose angle is counted, {ROWS} samples, {DRAWS} draws a row. A temperature",
-        f"coefficient of {TIMES:g} times the least standard error there can be, by the dense covariance of what was drawn; its",
-        "error (rms) and uncertainty (median) in that unit, the white noise found in that which was drawn. Counts: standard",
-        "deviation of their errors over the angle that white noise turns by in a sample. Not told apart, the search and the",
-        "fit take them for white noise, flicker and walk of the rate.",
+        f"coefficient of {TIMES:g} times the least standard error there can be, by the dense covariance of what was",
+        "drawn; its error (rms) and uncertainty (median) in that unit, the white noise found in that which was drawn.",
+        "Counts: standard deviation of their errors over the angle that white noise turns by in a sample. Not told",
+        "apart, the search and the fit take them for white noise, flicker and walk of the rate.",
         "",
         *table(head, rows),
     ]
-    write_result("angle_noise", "Noise of a counted angle", "benchmarks.angle_noise", argv, lines)
+    write_result("angle_noise", "Noise of a counted angle", "angle_noise", argv, lines)
 
 
 if __name__ == "__main__":

@@ -251,9 +251,6 @@ def test_an_extended_model_states_hops_that_were_found(tmp_path: Path, rng: np.r
         ("value: 1 deg/h", "needs a time_low and a time_high"),
         ("value: 1 deg/h, time_low: 3 s, time_high: 4 s, time_constant: 5 s", "has no time_constant"),
         ("value: 1 deg/h, time_low: 3 s, time_high: 4 s}\n  - {effect: noise_flicker, value: 1 deg/h", "cannot stand"),
-            "value: 1 deg/h, time_low: 3 s, time_high: 4 s}\n  - {effect: noise_flicker, value: 1 deg/h",
-            "cannot stand beside",
-        ),
     ],
 )
 def test_hops_are_stated_with_their_times_and_without_flicker(rest: str, said: str, tmp_path: Path):
