@@ -22,6 +22,8 @@ from gyromodel.units import UnitError, convertible, factor, quantity
 
 # A step this many times the median within runs, where a run begins, is time in which the gyro was off.
 OFF = 1.5
+# Rounding errors of one sample that stand for all on the way from what was measured to what is compared.
+ROUNDED = 4.0
 # Longer records are padded less: the work outweighs the compiling.
 FINER_FROM = 4096
 # How far most of the samples of a clock are from whole steps of it, in steps.
@@ -74,6 +76,12 @@ class Record(NamedTuple):
     def present(self) -> np.ndarray:
         """Real rows with an output."""
         return np.asarray(self.sampling.present)[: self.rows]
+
+    @property
+    def imprecision(self) -> float:
+        """The variance that double precision leaves of a sample: its rounding, and that of what it is compared with."""
+        size = float(np.nanmax(np.abs(np.asarray(self.signals["output"])), initial=0.0))
+        return (ROUNDED * np.finfo(float).eps * size) ** 2
 
     @property
     def run(self) -> np.ndarray:

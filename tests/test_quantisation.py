@@ -364,7 +364,32 @@ def test_exact_outputs_of_even_rates_are_no_steps():
     columns = {"time": np.arange(200.0), "rate": rate, "output": 1.001 * rate}
     campaign = gm.Campaign(columns, {"time": "s", "rate": "deg/s", "output": "deg/s"}, {"kind": "rate"})
     found = gm.diagnose(campaign, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
-    assert "quantisation" not in {c.effect for c in found.causes}
+    assert (found.verdict, found.causes) == ("adequate", ())
+
+
+@pytest.mark.parametrize("hidden", ["", "bias_temperature", "scale_nonlinearity", "bias_periodic"])
+@pytest.mark.parametrize("scale", [1.001, 1234.5])
+def test_data_without_noise_show_what_is_hidden_and_no_rounding_of_doubles(
+    hidden: str, scale: float, rng: np.random.Generator
+):
+    time = np.arange(600.0)
+    rate, warm = 50.0 * np.sin(time / 30.0) + rng.uniform(-1.0, 1.0, 600), 10.0 * np.sin(time / 200.0)
+    more = {
+        "bias_temperature": 3e-3 * warm,
+        "scale_nonlinearity": 1e-6 * rate**2,
+        "bias_periodic": 0.01 * np.sin(0.7 * time),
+    }
+    columns = {
+        "time": time,
+        "rate": rate,
+        "temperature": 25.0 + warm,
+        "output": scale * (rate + more.get(hidden, 0.02)),
+    }
+    units = {"time": "s", "rate": "deg/s", "temperature": "degC", "output": "deg/s" if scale < 2 else "count/s"}
+    campaign = gm.Campaign(columns, units, {"kind": "rate"})
+    found = gm.diagnose(campaign, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
+    assert [c.effect for c in found.causes] == [hidden] * bool(hidden)
+    assert found.verdict == ("named" if hidden else "adequate")
 
 
 def test_many_campaigns_in_steps_are_fitted_one_at_a_time():

@@ -47,8 +47,8 @@ class OneCell:
         scaled = against[:, :p] / np.outer(norm, norm) + 1e-13 * np.eye(p)
         root = np.linalg.inv(np.linalg.cholesky(scaled)) / norm
         jy = root @ against[:, p:]
-        rss = np.maximum(np.sum(x[:, p:] * z[:, p:], axis=0) - np.sum(jy**2, axis=0), 1e-300)
         self._nu = nu = scanner.degrees_of_freedom - p
+        rss = np.maximum(np.sum(x[:, p:] * z[:, p:], axis=0) - np.sum(jy**2, axis=0), max(nu * scanner.least, 1e-300))
         log_j = 2.0 * np.log(norm).sum() + np.linalg.slogdet(scaled)[1]
         log_likelihood = -0.5 * self._cell.log_determinant - 0.5 * log_j - 0.5 * nu * np.log(rss)
         self.batch = Batch(log_likelihood, rss, {}, {}, {}, {})

@@ -52,6 +52,8 @@ class Scanner:
         # Of the readings that the output is computed from; none of a gyro.
         self.step = step
         self.present = np.asarray(record.sampling.present)
+        # Of data without noise rounding is what is left, and no structure.
+        self.least = record.imprecision
         self.runs = int(np.asarray(record.sampling.restart).sum())
         self.steps = "bias_step" in bank.scans
         self.lines = line_grid(record) if "bias_periodic" in bank.scans and record.rows >= 16 else None

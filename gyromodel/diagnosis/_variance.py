@@ -81,7 +81,9 @@ class Growth(NamedTuple):
 
 
 def growing_noise(record: Record, estimate: Estimate) -> Growth | None:
-    """The driver that the noise level follows most; None where it follows none."""
+    """The driver that the noise level follows most; None where it follows none, or there is none but rounding."""
+    if estimate.white_variance <= record.imprecision:
+        return None
     use = np.isfinite(estimate.whitened)
     # Large residuals are shortened, so that a few gross errors do not pass for a trend.
     e = np.minimum(estimate.whitened[use] ** 2, 9.0)
@@ -140,7 +142,7 @@ def follow(estimate: Estimate, grows: Growth) -> str | None:
 def tails(estimate: Estimate) -> str | None:
     """A sentence where whitened residuals have far heavier tails than a normal distribution."""
     e = estimate.whitened[np.isfinite(estimate.whitened)]
-    if len(e) < 50 or not e.std():
+    if len(e) < 50 or not e.std() or estimate.white_variance <= estimate.record.imprecision:
         return None
     excess = stats.kurtosis(e)
     if excess / np.sqrt(24.0 / len(e)) < HEAVY:

@@ -282,10 +282,10 @@ def _finish(
     if ordinary:
         covariance = _ordinary_covariance(record, filter, jacobian, model)
     nu = len(w) - p
-    # Of data without noise, what double precision leaves of their size.
-    least = (np.finfo(float).eps * float(np.nanmax(np.abs(np.asarray(output)), initial=0.0))) ** 2
-    white = max(float(w[:, p] @ w[:, p]) / nu, least) if variance is None else variance
-    likelihood = from_grams(np.atleast_1d(filter.log_determinant), (w.T @ w)[None], len(w)).log_likelihood[0]
+    white = max(float(w[:, p] @ w[:, p]) / nu, record.imprecision) if variance is None else variance
+    gram = w.T @ w
+    gram[p, p] += nu * record.imprecision
+    likelihood = from_grams(np.atleast_1d(filter.log_determinant), gram[None], len(w)).log_likelihood[0]
     noise = dict(model.noise) or noise_coefficients(ratios, white, record, float(model.gain()))
     rows = record.rows
     whitened = np.full(rows, np.nan)
