@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int
 from scipy import stats
 
 from gyromodel._checks import listed, thermometers
+from gyromodel._noise_level import with_stated_level
 from gyromodel._output_rate import rate_output
 from gyromodel.attitude import with_reference_rates
 from gyromodel.averages import MEAN_OF_ATTITUDE, average
@@ -25,7 +26,6 @@ from gyromodel.effects import Signals
 from gyromodel.effects.power_cycles import BiasTurnOn, cycles
 from gyromodel.estimate import Calibration, check_covariates, step_of, validity_unit
 from gyromodel.model import GyroModel, ModelError, check_domain, check_units
-from gyromodel.noise_level import with_stated_level
 from gyromodel.signals import Record, read_signals
 from gyromodel.units import from_internal
 

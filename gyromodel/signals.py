@@ -43,7 +43,8 @@ class Record(NamedTuple):
     `output` is a rate-type output (increments divided by their interval, angles differenced), or of a platform the
     angle of its base less that of the table; `rows` is the number of
     real rows before padding; `interval` the usual time (s) between rows with an output; `units` the file's units by
-    column; `blocks` numbers the stretches that replicate one another.
+    column; `blocks` numbers the stretches that replicate one another; `in_steps` says that each sample of the rate was
+    read in steps of its own, which no angle's count explains.
     """
 
     signals: dict[str, Float[Array, " sample"]]
@@ -55,6 +56,7 @@ class Record(NamedTuple):
     blocks: np.ndarray
     block_scheme: str
     data_hash: str = ""
+    in_steps: bool = False
 
     @property
     def domain(self) -> Domain:

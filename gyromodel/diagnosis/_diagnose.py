@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gyromodel._checks import listed
+from gyromodel._noise_level import with_level, with_stated_level
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._calibrate import null_scores, threshold_of
 from gyromodel.diagnosis._data import Data, read
@@ -48,7 +49,6 @@ from gyromodel.estimate import (
 )
 from gyromodel.model import GyroModel, Level
 from gyromodel.noise import MARKOV_TIME, TELEGRAPH_TIMES
-from gyromodel.noise_level import with_level, with_stated_level
 from gyromodel.signals import with_columns_known
 from gyromodel.units import factor, from_internal, internal_unit
 

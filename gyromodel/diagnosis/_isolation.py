@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from gyromodel._noise_level import with_stated_level
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._added_tests import added_tests
 from gyromodel.diagnosis._bank import PART_OF, build_bank
@@ -22,7 +23,6 @@ from gyromodel.effects._base import evaluate
 from gyromodel.estimate import Estimate, as_read, filter_of, given_ratios, step_of, whiten_columns
 from gyromodel.model import GyroModel, ModelError, effect_class, make_effect, parameter_unit
 from gyromodel.noise import NoiseRatios
-from gyromodel.noise_level import with_stated_level
 from gyromodel.signals import Record, read_signals, with_columns_known
 from gyromodel.units import factor, internal_unit
 

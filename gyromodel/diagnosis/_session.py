@@ -138,7 +138,7 @@ def over_unrounded(
         return None
     try:
         corrected = record.signals | {"output": found.record.signals["output"]}
-        record = record._replace(signals=corrected)
+        record = record._replace(signals=corrected, in_steps=True)
         if found.saw_tooth:
             record = record.without(np.flatnonzero(record.present & ~found.record.present))
         return laid_out(record, model, threshold, outliers=not found.saw_tooth)

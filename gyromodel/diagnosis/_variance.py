@@ -9,11 +9,11 @@ import numpy as np
 from scipy import stats
 
 from gyromodel._checks import thermometers
+from gyromodel._noise_level import FORMS
 from gyromodel.campaign import Campaign
 from gyromodel.declarations import RATE_OF
 from gyromodel.estimate import Estimate
 from gyromodel.model import Level
-from gyromodel.noise_level import FORMS
 from gyromodel.numerics.rounding import quantum
 from gyromodel.signals import Record
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gyromodel._checks import CampaignError
+from gyromodel._noise_level import with_stated_level
 from gyromodel.attitude import refuse_navigated, with_reference_rates
 from gyromodel.averages import MEAN_OF_ATTITUDE, average
 from gyromodel.campaign import Campaign
@@ -22,7 +23,6 @@ from gyromodel.estimate._rounding import fit_readings, with_step_of
 from gyromodel.estimate._whitening import filter_of, pad_columns, whiten_columns
 from gyromodel.model import GyroModel, ModelError, check_domain, check_units
 from gyromodel.noise import NoiseRatios, from_grams, stated_ratios
-from gyromodel.noise_level import with_stated_level
 from gyromodel.numerics.least_squares import Normal, Solution, levenberg_marquardt
 from gyromodel.numerics.state_space import Filter, colour, whitened_gram
 from gyromodel.numerics.uncertain import Source

@@ -72,7 +72,7 @@ def best_ratios(
     if markov is not False and len(cells.flicker):
         other, likeliest = _refined(likelihood, *_likeliest(likelihood, cells), COARSE_STEPS)
         best = other if markov or likeliest > top + MARKOV_LEAD else best
-    if best.quantisation is not None or record.domain != "gyro":
+    if best.quantisation is not None or record.domain != "gyro" or record.in_steps:
         return best
     columns = pad_columns(residual[:, None])
     whitened = np.where(

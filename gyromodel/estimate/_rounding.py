@@ -116,6 +116,7 @@ def fit_readings(
     """As `fit_record`, of a model that reads its output in steps; `fit` fits one that does not."""
     step = step_of(model, record)
     step = step if step and _offset(record, step) is not None else 0.0
+    record = record._replace(in_steps=step > 0.0)
     bare = as_read(model, record, step)
     estimate = fit(record, bare, ratios=ratios)
 

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from gyromodel._noise_level import with_stated_level
 from gyromodel.estimate import as_read, make_filter, step_of
 from gyromodel.model import ModelError
 from gyromodel.noise import NoiseRatios, markov_sum, stated_ratios
-from gyromodel.noise_level import with_stated_level
 from gyromodel.numerics.state_space import colour
 from gyromodel.signals import Record
 from gyromodel.study._instruments import Instrument, by_column
