@@ -25,7 +25,7 @@ ROWS, STEP = 900, 10.0
 WHITE = np.deg2rad(0.002) / 60.0  # rad/sqrt(s)
 # Standard deviation of the counts' errors over what white noise turns by in a sample.
 COUNTS = (0.3, 1.0, 3.0, 10.0)
-DRAWS, TIMES = 40, 4.0
+DRAWS, TIMES = 24, 4.0
 
 
 class Known(NamedTuple):
