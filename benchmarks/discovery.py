@@ -35,11 +35,12 @@ from tests.truth.noise import FAMILY, OUTSIDE
 RESULTS = Path(__file__).parent / "results"
 # Campaigns at full scale, by what is hidden in them.
 NULLS, EFFECTS, CURVE, OUTER, UNKNOWNS, PAIRS = 400, 600, 200, 150, 300, 400
+MOVING = 48  # of unlisted errors, and of pairs, of gyros that are tumbled, turned and driven
 INSEPARABLE, CALIBRATED, MUTATED = 120, 200, 60
 # However small the part, so many of what is counted in few campaigns.
 FEWEST = 24
 # Parts that an oracle is asked about which knows how levels of noise are drawn.
-ORACLE = ("nothing", "nothing, moving", "inseparable", "unknown 10")
+ORACLE = ("nothing", "nothing, moving", "inseparable", "unknown 10", "unknown 10, moving")
 DRAWS = 200  # of a calibration whose p-values are looked at
 # Diagnoses timed: campaigns of about 1000 rows.
 TIMED = ("static_cycle", "rate_temperature", "rate_steps", "tumble")
@@ -116,6 +117,10 @@ def _plan(seed: int, scale: float, controls: Sequence[str]) -> Iterator[tuple[st
     yield "unknown 3", study.unknown_cases(many(UNKNOWNS), seed + 20, 3.0, FAMILY), beside
     yield "unknown 10", study.unknown_cases(many(UNKNOWNS), seed + 21, 10.0, FAMILY), {}
     yield "pairs", study.pair_cases(many(PAIRS), seed + 25, 3.0, FAMILY), {}
+    for size in (3.0, 10.0):
+        cases = study.moving_unknown_cases(many(MOVING), seed + 90 + int(size), size)
+        yield f"unknown {size:g}, moving", cases, {}
+    yield "pairs, moving", study.moving_pair_cases(many(MOVING), seed + 91, 3.0), {}
     yield "inseparable", study.inseparable_cases(few(INSEPARABLE), seed + 30), {"after": True}
     yield "drifts", study.drift_cases(few(INSEPARABLE), seed + 31), {}
     # With a safeguard off, and the same campaigns with it on.

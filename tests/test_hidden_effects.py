@@ -86,7 +86,7 @@ def test_every_effect_of_the_catalogue_is_hidden_by_some_test():
 
 
 def test_every_uncatalogued_shape_is_in_a_campaign():
-    hidden = {c.effect for c in study.unknown_cases(8, 0, 3.0)}
+    hidden = {c.effect for c in [*study.unknown_cases(8, 0, 3.0), *study.moving_unknown_cases(24, 0, 3.0)]}
     assert hidden == {e for names in UNCATALOGUED.values() for e in names}
 
 

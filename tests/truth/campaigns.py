@@ -51,6 +51,9 @@ UNCATALOGUED: dict[str, tuple[str, ...]] = {
         "buried_temperature_ripple",
     ),
     C: ("rate_ripple",),
+    "tumble": ("temperature_ripple", "acceleration_spin_ripple"),
+    "turntable": ("temperature_ripple",),
+    "dynamic_rates": ("temperature_ripple", "rate_ripple", "vibration_ripple"),
 }
 
 

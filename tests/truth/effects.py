@@ -214,8 +214,9 @@ EFFECTS: dict[str, Effect] = {
     )
 } | {f"bias_{c}": _linear(c) for c in ("supply_voltage", "pressure", "laser_current")} | MOTION_EFFECTS  # fmt: skip
 
+RIPPLING = ("temperature", "rate", "supply_voltage", "acceleration_spin", "vibration")
 UNKNOWN: dict[str, tuple[Effect, tuple[str, ...]]] = {  # effect and the columns it follows
-    **{f"{c}_ripple": (_ripple(c), (c,)) for c in ("temperature", "rate", "supply_voltage")},
+    **{f"{c}_ripple": (_ripple(c), (c,)) for c in RIPPLING},
     "pressure_bump": (pressure_bump, ("pressure",)),
     "pressure_switch": (pressure_switch, ("pressure",)),
     "rate_temperature_bump": (rate_temperature_bump, ("rate", "temperature")),
@@ -257,9 +258,7 @@ SHAPES: dict[str, Callable[[Design, np.random.Generator], dict[str, Any]]] = {
     "bias_step": lambda design, rng: {"at": rng.uniform(*np.quantile(design.true["time"], [0.1, 0.9]))},
     "bias_warmup": lambda design, rng: {"tau": rng.uniform(0.05, 0.25) * design.true["time"][-1]},
     "bias_periodic": _draw_line,
-    "temperature_ripple": _draw_ripple,
-    "rate_ripple": _draw_ripple,
-    "supply_voltage_ripple": _draw_ripple,
+    **{f"{c}_ripple": _draw_ripple for c in RIPPLING},
     "temperature_rate_switch": lambda design, rng: {"width": rng.uniform(0.05, 0.15)},
     "buried_temperature_ripple": lambda design, rng: {
         "cycles": rng.uniform(2.0, 3.0),

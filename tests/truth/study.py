@@ -260,7 +260,7 @@ def curve_cases(count: int, seed: int, times_mde: float, noises: Iterable[str] =
 
 def unknown_cases(count: int, seed: int, times_mde: float, noises: Iterable[str] = FAMILY[:3]) -> list[Case]:
     """Effects that no catalogue has, in turn."""
-    names = sorted({e for d in UNCATALOGUED for e in UNCATALOGUED[d]})
+    names = sorted({e for d in HOMES for e in UNCATALOGUED.get(d, ())})
     return _in_turn(count, seed, times_mde, tuple(noises), names, UNCATALOGUED)
 
 
@@ -276,6 +276,24 @@ def pair_cases(count: int, seed: int, times_mde: float, noises: Iterable[str] = 
     order = np.random.default_rng(seed).permutation(len(cells))
     chosen = [cells[order[i % len(cells)]] for i in range(count)]
     return [Case(s, d, n, f"{a}+{b}", times_mde) for s, (d, n, a, b) in zip(_seeds(seed, count), chosen, strict=True)]
+
+
+def moving_unknown_cases(count: int, seed: int, times_mde: float, noises: Iterable[str] = FAMILY) -> list[Case]:
+    """As `unknown_cases`, of gyros that are tumbled, turned and driven, in an order of the seed."""
+    cells = [(d, n, e) for d in MOTION for n in noises for e in UNCATALOGUED[d]]
+    return _in_order(cells, count, seed, times_mde)
+
+
+def moving_pair_cases(count: int, seed: int, times_mde: float, noises: Iterable[str] = FAMILY) -> list[Case]:
+    """As `pair_cases`, of gyros that are tumbled, turned and driven."""
+    pairs = {d: combinations([e for e in TESTABLE[d] if e in MOTION_EFFECTS], 2) for d in MOTION}
+    cells = [(d, n, f"{a}+{b}") for d, of_design in pairs.items() for a, b in of_design for n in noises]
+    return _in_order(cells, count, seed, times_mde)
+
+
+def _in_order(cells: list[tuple[str, str, str]], count: int, seed: int, times_mde: float) -> list[Case]:
+    order = np.random.default_rng(seed).permutation(len(cells))
+    return [Case(s, *cells[order[i % len(cells)]], times_mde) for i, s in enumerate(_seeds(seed, count))]
 
 
 def inseparable_cases(count: int, seed: int) -> list[Case]:
