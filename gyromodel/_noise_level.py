@@ -20,13 +20,23 @@ FORMS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
-def relative_variance(ratio: float, level: Level, values: np.ndarray) -> np.ndarray:
+def relative_variance(level: Level, values: np.ndarray) -> np.ndarray:
     """White variance at values of a level's column, over that halfway; beyond its ends as there.
 
-    ln σ is linear from end to end, and `ratio` is σ at the one over σ at the other.
+    ln σ is linear from end to end.
     """
     share = np.clip((FORMS[level.driver](values) - level.low) / (level.high - level.low), 0.0, 1.0)
-    return ratio ** (2.0 * share - 1.0)
+    return level.ratio ** (2.0 * share - 1.0)
+
+
+def level_of(record: Record, model: GyroModel) -> np.ndarray:
+    """The relative white variance of each sample that a model states; NaN where what it follows is missing."""
+    level = model.level
+    if level is None:
+        return np.ones(len(record.sampling.present))
+    if level.driver not in record.signals:
+        return np.full(len(record.sampling.present), np.nan)
+    return relative_variance(level, np.asarray(record.signals[level.driver]))
 
 
 def with_stated_level(record: Record, model: GyroModel) -> Record:
@@ -35,28 +45,34 @@ def with_stated_level(record: Record, model: GyroModel) -> Record:
     Raises:
         ModelError: a value of the column is missing where there is an output.
     """
-    level, ratio = model.level, model.noise.get("noise_heteroscedastic")
-    if level is None or ratio is None:
+    if model.level is None:
         return record
-    if level.driver not in record.signals:
-        raise ModelError(f"noise_heteroscedastic follows {level.driver}, which the campaign lacks")
-    values = np.asarray(record.signals[level.driver])
-    known = np.isfinite(values)
-    if not known[: record.rows][record.present].all():
-        raise ModelError(f"noise_heteroscedastic follows {level.driver}, which lacks values where there is an output")
-    factor = np.where(known, relative_variance(float(ratio), level, np.where(known, values, level.low)), 1.0)
-    return record._replace(sampling=record.sampling._replace(white=jnp.asarray(record.sampling.white * factor)))
+    if model.level.driver not in record.signals:
+        raise ModelError(f"noise_heteroscedastic follows {model.level.driver}, which the campaign lacks")
+    factor = level_of(record, model)
+    if not np.isfinite(factor[: record.rows][record.present]).all():
+        raise ModelError(
+            f"noise_heteroscedastic follows {model.level.driver}, which lacks values where there is an output"
+        )
+    white = record.sampling.white * np.where(np.isfinite(factor), factor, 1.0)
+    return record._replace(sampling=record.sampling._replace(white=jnp.asarray(white)))
 
 
-def with_level(model: GyroModel, ratio: float, level: Level) -> GyroModel:
-    """The model with a level that its noise follows, beside one of the same column that it states already.
+def with_level(model: GyroModel, level: Level) -> GyroModel:
+    """A fitted model with a level that its noise follows, beside one of the same column that it has already.
 
-    One of another column stays as it is, as one alone can be stated.
+    One of another column, or of a part of this one's range, stays as it is, as one alone can be stated.
     """
-    stated = model.level
-    if stated is not None and stated.driver != level.driver:
+    had = model.level
+    if had is None:
+        return replace(model, level=level)
+    if had.driver != level.driver or not had.low <= level.low < level.high <= had.high:
         return model
-    if stated is not None:
-        steeper = float(model.noise["noise_heteroscedastic"]) ** ((level.high - level.low) / (stated.high - stated.low))
-        ratio *= steeper
-    return replace(model, noise={**model.noise, "noise_heteroscedastic": jnp.asarray(ratio)}, level=level)
+    slope = np.log(had.ratio) / (had.high - had.low)
+    ratio = level.ratio * float(np.exp(slope * (level.high - level.low)))
+    # White noise is that halfway, which is elsewhere now.
+    middle = 0.5 * (level.low + level.high) - 0.5 * (had.low + had.high)
+    noise = dict(model.noise)
+    if "noise_white" in noise:
+        noise["noise_white"] = noise["noise_white"] * float(np.exp(slope * middle))
+    return replace(model, level=level._replace(ratio=ratio), noise=noise)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 from scipy import stats
 
 from gyromodel._checks import listed, thermometers
-from gyromodel._noise_level import with_stated_level
+from gyromodel._noise_level import level_of
 from gyromodel._output_rate import rate_output
 from gyromodel.attitude import with_reference_rates
 from gyromodel.averages import MEAN_OF_ATTITUDE, average
@@ -169,14 +169,12 @@ def _estimate(calibration: Calibration, record: Record) -> tuple[np.ndarray, np.
         steps += (step_of(model, record) / model.gain()) ** 2 / 12.0
     spread = np.zeros((len(model.slots()),) * 2) if covariance is None else covariance
     # The whole record at once: effects may look at what came before.
-    level = jnp.ones(output.shape)
-    found = _solve(model, jnp.asarray(spread), white * level + steps, signals, output)
+    found = _solve(model, jnp.asarray(spread), jnp.full(output.shape, white + steps), signals, output)
     if model.level is not None:
-        # A level that follows the rate follows that which was found.
-        rated = record._replace(signals={**record.signals, "rate": jnp.nan_to_num(found[0])})
-        known = rated if model.level.driver == "rate" else record
-        level = with_stated_level(known, model).sampling.white / record.sampling.white
-        found = _solve(model, jnp.asarray(spread), white * level + steps, signals, output)
+        # A level that follows the rate follows that which was found. Where it is not known the rate is.
+        rated = record._replace(signals={**record.signals, "rate": found[0]})
+        level = level_of(rated if model.level.driver == "rate" else record, model)
+        found = found[0], _solve(model, jnp.asarray(spread), white * level + steps, signals, output)[1]
     rate, variance = (np.asarray(values)[: record.rows] for values in found)
     return rate, variance if _held(calibration) else np.full_like(variance, np.nan)
 

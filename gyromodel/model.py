@@ -47,14 +47,15 @@ class Slot(NamedTuple):
 
 
 class Level(NamedTuple):
-    """The column that the noise level follows, and the two of its values that the ratio of levels is of.
+    """A noise level that follows a column: `ratio` is σ at its value `high` over σ at `low`, in internal units.
 
-    Internal units; of rate and temperature_rate the size.
+    Of rate and temperature_rate it is the size that counts.
     """
 
     driver: str
     low: float
     high: float
+    ratio: float
 
 
 # What the noise level may follow, and the units it is written in.
@@ -66,8 +67,8 @@ class GyroModel(eqx.Module):
 
     `noise` holds coefficients in internal units by noise id, or is empty for "estimate it"; `fixed` names the
     parameters that are known, as (effect label, field); `noise_of` says whether the noise is stated as that of a gyro's
-    rate or of a platform's angle, and `level` what its level follows, by a factor of noise_heteroscedastic. A model
-    without effects and noise is of either.
+    rate or of a platform's angle, and `level` what the level of its white noise follows, stated or estimated
+    (noise_heteroscedastic). A model without effects and noise is of either.
     """
 
     effects: tuple[Effect, ...]
@@ -89,9 +90,11 @@ class GyroModel(eqx.Module):
         unknown = set(self.noise) - set(NOISE_UNITS)
         if unknown:
             raise ModelError(f"unknown noise {min(unknown)}; known are {', '.join(NOISE_UNITS)}")
-        stated = self.level is not None and self.level.driver in LEVEL_UNITS and self.level.low < self.level.high
-        if "noise_heteroscedastic" in self.noise and not stated:
-            raise ModelError("noise_heteroscedastic needs what it follows, from a value to a larger one")
+        if (level := self.level) is not None:
+            if level.driver not in LEVEL_UNITS or not level.low < level.high:
+                raise ModelError("noise_heteroscedastic needs what it follows, from a value to a larger one")
+            if not level.ratio > 0:
+                raise ModelError("noise_heteroscedastic is a ratio of noise levels, and above zero")
         kinds: dict[str, str] = {e.domain: e.label for e in self.effects} | (
             {self.noise_of: "noise"} if self.noise else {}
         )

@@ -27,7 +27,8 @@ from gyromodel.signals import Record
 from gyromodel.units import convertible, from_internal, internal_unit
 
 # Written into fitted models; `read_calibration` reads them, and no other use of the model needs them.
-# How what a noise level follows is written.
+# A noise level that follows a column, and how that is written.
+LEVEL = "noise_heteroscedastic"
 LEVEL_KEYS = ("driver", "from", "to")
 RECORD_KEYS = ("fit", "software")
 # What a scale factor can be: output per rate; a plain number where the output is itself a rate.
@@ -259,14 +260,17 @@ def _read_noise(place: Place, of: list[Domain]) -> tuple[dict[str, float], Domai
         if "effect" not in entry or "value" not in entry:
             raise item.error("each noise entry needs an effect: id and a value")
         name = entry["effect"].text()
-        known = [k for k in NOISE_UNITS if k not in TIMES]
+        known = [*(k for k in NOISE_UNITS if k not in TIMES), LEVEL]
         if name not in known:
             raise entry["effect"].error(f"unknown noise {name}; known are {', '.join(known)}")
-        if name in noise:
+        if name in noise or (name == LEVEL and level is not None):
             raise entry["effect"].error(f"{name} appears twice")
-        of = [domain for domain in of if name in noise_units(domain)]
+        of = [domain for domain in of if name in noise_units(domain) or (name == LEVEL and domain == "gyro")]
         if not of:
             raise entry["effect"].error(f"{name} is noise of a rate, and not of the angle of a platform's base")
+        if name == LEVEL:
+            level = _read_level(item, entry)
+            continue
         noise[name] = entry["value"].number_in(*(noise_units(domain)[name] for domain in of))
         of = [d for d in of if convertible(entry["value"].quantity()[1], noise_units(d)[name])]
         if noise[name] < 0:
@@ -276,9 +280,7 @@ def _read_noise(place: Place, of: list[Domain]) -> tuple[dict[str, float], Domai
             if of_kind is None:
                 raise entry[key].error(f"{name} has no {key}")
             noise[of_kind] = entry[key].number_in(NOISE_UNITS[of_kind])
-        if name == "noise_heteroscedastic":
-            level = _read_level(item, entry)
-        elif extra := next((key for key in LEVEL_KEYS if key in entry), None):
+        if extra := next((key for key in LEVEL_KEYS if key in entry), None):
             raise entry[extra].error(f"{name} has no {extra}")
     try:
         check_stated(noise)
@@ -297,7 +299,10 @@ def _read_level(item: Place, entry: dict[str, Place]) -> Level:
     low, high = (entry[key].number_in(LEVEL_UNITS[driver]) for key in LEVEL_KEYS[1:])
     if not low < high:
         raise entry["to"].error("noise_heteroscedastic goes from a value to a larger one")
-    return Level(driver, low, high)
+    ratio = entry["value"].number_in("")
+    if ratio <= 0:
+        raise entry["value"].error("noise_heteroscedastic is a ratio of noise levels, and above zero")
+    return Level(driver, low, high, ratio)
 
 
 def write_model(model: GyroModel | Estimate, path: str | Path) -> None:
@@ -342,11 +347,10 @@ def _document(model: GyroModel, estimate: Estimate | None) -> dict[str, Any]:
         document["effects"].append(entry)
     units = noise_units(model.noise_of)
     noise = {k: {"effect": k, "value": exact_text(float(v), units[k])} for k, v in model.noise.items()}
-    if "noise_heteroscedastic" in noise and model.level is not None:
-        driver, *ends = model.level
-        texts = [driver, *(exact_text(end, LEVEL_UNITS[driver]) for end in ends)]
-        ratio = float(model.noise["noise_heteroscedastic"])
-        noise["noise_heteroscedastic"] |= {"value": ratio, **dict(zip(LEVEL_KEYS, texts, strict=True))}
+    if model.level is not None:
+        driver, low, high, ratio = model.level
+        texts = [driver, *(exact_text(end, LEVEL_UNITS[driver]) for end in (low, high))]
+        noise[LEVEL] = {"effect": LEVEL, "value": ratio, **dict(zip(LEVEL_KEYS, texts, strict=True))}
     for name in TIMES.keys() & noise.keys():
         kind, what = TIMES[name]
         noise[kind][what] = noise.pop(name)["value"]

@@ -162,6 +162,8 @@ def _scanned(path: Path, axis: str | None, calibration: Calibration) -> _Scan | 
     with reading_parts(path) as opened:
         if opened is None or any(effect.remembers for effect in calibration.model.effects):
             return None
+    if (level := calibration.model.level) is not None and level.driver == "temperature_rate":
+        return None  # that of a smooth curve through the whole record
     needed = {name for effect in calibration.model.effects for name in effect.columns_needed} - {"rate"}
     steps, scan, row = Counter[float](), None, 1
     last, end, lowest, highest, numbers = None, np.zeros(0), np.inf, -np.inf, set[float]()

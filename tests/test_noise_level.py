@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import gyromodel as gm
+from gyromodel._noise_level import relative_variance, with_level
 from gyromodel.compensation import compensate
 from gyromodel.estimate import fit_many
 from gyromodel.model import Level, ModelError
@@ -41,8 +42,7 @@ def campaign(rng: np.random.Generator, ratio: float) -> gm.Campaign:
 
 def stated(ratio: float, *effects: str) -> gm.GyroModel:
     model = gm.model_from_effects(list(effects) or ["bias", "scale_factor"])
-    noise = {"noise_white": N, "noise_heteroscedastic": ratio}
-    return replace(model, noise=noise, level=Level("rate", 0.0, np.deg2rad(100.0)))
+    return replace(model, noise={"noise_white": N}, level=Level("rate", 0.0, np.deg2rad(100.0), ratio))
 
 
 def test_weights_are_those_of_least_squares_by_hand(rng: np.random.Generator):
@@ -66,7 +66,7 @@ def test_a_file_says_what_it_follows_and_simulates_it(tmp_path: Path, rng: np.ra
     path.write_text(FILE.format(rest="value: 4, driver: rate, from: 0 deg/s, to: 100 deg/s"))
     model = gm.read_model(path)
     gm.write_model(model, path)
-    assert gm.read_model(path).level == model.level == Level("rate", 0.0, np.deg2rad(100.0))
+    assert gm.read_model(path).level == model.level == Level("rate", 0.0, np.deg2rad(100.0), 4.0)
     model = model.with_vector(np.array([0.0, 1.0]))
     drawn = [gm.simulate(model, campaign(rng, 1.0), seed=int(s)) for s in rng.integers(2**31, size=20)]
     error = np.concatenate([d.columns["output"] - rates() for d in drawn])
@@ -95,7 +95,7 @@ def test_what_it_follows_must_be_said_whole(rest: str, said: str, tmp_path: Path
 
 def test_a_campaign_without_the_column_is_refused(rng: np.random.Generator):
     measured = campaign(rng, 2.0)
-    model = replace(stated(2.0), level=Level("temperature", 0.0, 40.0))
+    model = replace(stated(2.0), level=Level("temperature", 0.0, 40.0, 2.0))
     with pytest.raises(ModelError, match="noise_heteroscedastic follows temperature, which the campaign lacks"):
         gm.fit(measured, model)
 
@@ -106,11 +106,47 @@ def test_the_extended_model_states_what_was_found_and_is_adequate(tmp_path: Path
     assert first.verdict == "adequate"
     gm.write_model(first.extended, tmp_path / "extended.yaml")
     extended = gm.read_model(tmp_path / "extended.yaml")
-    assert float(extended.noise["noise_heteroscedastic"]) == pytest.approx(4.0, rel=0.35)
+    assert extended.level is not None
+    assert extended.level.ratio == pytest.approx(4.0, rel=0.35)
     assert gm.diagnose(campaign(rng, 4.0), extended, hold_out=False).verdict == "adequate"
     # One that is not as in the data is told of.
-    steady = replace(extended, noise={k: v for k, v in extended.noise.items() if "hetero" not in k}, level=None)
+    steady = replace(extended, level=None)
     assert gm.diagnose(campaign(rng, 4.0), steady, hold_out=False).causes[0].effect == "noise_heteroscedastic"
+
+
+@pytest.mark.law
+def test_more_than_is_stated_beside_a_walk_that_is_not_is_stated_with_it(rng: np.random.Generator):
+    walk = np.cumsum(rng.standard_normal(ROWS)) * 0.3 * N / np.sqrt(STEP)
+    measured = campaign(rng, 8.0)
+    measured = measured.with_column("output", measured.columns["output"] + walk, "rad/s")
+    found = gm.diagnose(measured, stated(2.0), hold_out=False)
+    assert "noise_heteroscedastic" in {c.effect for c in found.causes}
+    assert found.extended.model.level is not None
+    assert found.extended.model.level.ratio == pytest.approx(8.0, rel=0.5)
+    assert found.noise["noise_heteroscedastic"]["value"] == found.extended.model.level.ratio
+
+
+def test_a_level_in_a_part_of_a_range_is_joined_to_that_of_the_whole(rng: np.random.Generator):
+    model = replace(stated(1.0), level=Level("temperature", 0.0, 60.0, 4.0))
+    joined = with_level(model, Level("temperature", 10.0, 30.0, 3.0))
+    at = np.linspace(10.0, 30.0, 7)
+    assert model.level is not None
+    assert joined.level is not None
+    apart = relative_variance(model.level, at) * relative_variance(Level("temperature", 10.0, 30.0, 3.0), at)
+    together = (
+        relative_variance(joined.level, at) * float(joined.noise["noise_white"] / model.noise["noise_white"]) ** 2
+    )
+    assert together == pytest.approx(apart, rel=1e-9)
+    other = Level("rate", 0.0, 1.0, 3.0)
+    assert with_level(model, other).level == model.level
+
+
+def test_a_calibration_without_the_column_of_its_level_tells_rates_without_scatter(rng: np.random.Generator):
+    calibration = gm.fit(campaign(rng, 5.0), stated(5.0)).calibration()
+    warm = replace(calibration, model=replace(calibration.model, level=Level("temperature", 0.0, 40.0, 2.0)))
+    told = compensate(campaign(rng, 5.0), warm).columns
+    assert np.isfinite(told["rate_estimated"]).all()
+    assert np.isnan(told["rate_estimated_std"]).all()
 
 
 def test_a_calibration_tells_the_scatter_at_the_rate_it_finds(rng: np.random.Generator):

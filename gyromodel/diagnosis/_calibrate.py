@@ -145,8 +145,9 @@ def _design(scanner: Scanner, baseline: Estimate, draws: int, seed: int) -> tupl
     """A digest of what must be the same for draws to serve, and the course of what may differ a little."""
     record, bank = scanner.record, scanner.bank
     searched = [*((b.name, b.structure) for b in bank.blocks if b.kind == "effect"), *bank.scans]
-    same = (__version__, RULE, EXEMPT, baseline.model.labels, sorted(baseline.model.fixed), scanner.stated, draws,
-            seed, searched, scanner.runs)  # fmt: skip
+    model = baseline.model
+    same = (__version__, RULE, EXEMPT, model.labels, sorted(model.fixed), model.level, scanner.stated, draws, seed,
+            searched, scanner.runs)  # fmt: skip
     columns = []
     for name in sorted(n for n in record.signals if n.startswith(SET)):
         values = np.asarray(record.signals[name])[: record.rows]

@@ -194,10 +194,6 @@ def diagnose(
     scale = factor(record.input_unit, unit)
     ordinary = tuple(hold_out and session.ladder(e)[2] for e in (baseline, selection.estimate))
     extended = _finished(selection.estimate, ordinary[1])
-    if grows and (level := grows.level(record)):
-        extended = _following(extended, grows, level)
-    if hops is not None:
-        extended = _hopping(extended, hops)
     weights = ordinary[0], extended.ordinary
     extended = readings.widened(as_it_was, extended, rounding)
     if extended.ordinary:
@@ -246,6 +242,10 @@ def diagnose(
         extended = with_reading(extended, steps, given, as_it_was)
     if reading:
         baseline = with_reading(baseline, reading, given, as_it_was)
+    if grows and record.domain == "gyro" and (level := grows.level(record)):
+        extended = _following(extended, grows, level)
+    if hops is not None:
+        extended = _hopping(extended, hops)
     next_test = judgement.next_test
     if judgement.verdict == "ambiguous":
         alike = list(judgement.credible_set)
@@ -345,10 +345,10 @@ def _hopping(estimate: Estimate, hops: Cause) -> Estimate:
 
 def _following(estimate: Estimate, grows: Growth, level: Level) -> Estimate:
     """The fit with what its noise level follows as its model states it."""
-    model = with_level(estimate.model, grows.ratio, level)
-    if model is estimate.model:
+    model = with_level(estimate.model, level)
+    if model is estimate.model or model.level is None:
         return estimate
-    ratio, spread = float(model.noise["noise_heteroscedastic"]), np.exp(1.96 * grows.ratio_std / grows.ratio)
+    ratio, spread = model.level.ratio, float(np.exp(1.96 * grows.ratio_std / grows.ratio))
     interval = {**estimate.noise_interval, "noise_heteroscedastic": (ratio / spread, ratio * spread)}
     return replace(estimate, model=model, noise_interval=interval)
 

@@ -11,7 +11,15 @@ from scipy import stats
 from scipy.optimize import minimize
 
 from gyromodel.diagnosis._result import Cause, ParameterValue
-from gyromodel.estimate import Estimate, angle_noise, even_stretches, filter_of, fit_record, with_noise_intervals
+from gyromodel.estimate import (
+    Estimate,
+    EstimateError,
+    angle_noise,
+    even_stretches,
+    filter_of,
+    fit_record,
+    with_noise_intervals,
+)
 from gyromodel.noise import NoiseRatios
 from gyromodel.numerics.rounding import quantum
 from gyromodel.signals import Record
@@ -53,7 +61,10 @@ def quantisation(estimate: Estimate, threshold: float, stated: Estimate | None =
     whole = 1.0 + 2.0 * angle
     without = NoiseRatios(flicker / whole, walk / whole, markov / whole, constant)
     held = 0.0 if stated is None else float(stated.model.noise.get("noise_quantisation", 0.0))
-    before = stated if held else fit_record(estimate.record, estimate.model_as_given(), ratios=without)
+    try:
+        before = stated if held else fit_record(estimate.record, estimate.model_as_given(), ratios=without)
+    except EstimateError:
+        return None
     assert before is not None
     found = angle_noise(before.whitened, estimate.record)
     if found is None or found.evidence < threshold:

@@ -157,7 +157,9 @@ def over_smooth_thermometers(
     if _lost_to_thermometers(session, record, selection) < LOST:
         return None
     try:
-        smooth = laid_out(record, model, session.threshold, outliers=session.scanner.outliers)
+        smooth = laid_out(
+            record, model, session.threshold, outliers=session.scanner.outliers, start=_counted(session.baseline)
+        )
     except EstimateError:
         return None
     other = smooth.run(say)
@@ -204,7 +206,7 @@ def over_weighted(
     """The search of samples weighted by their noise levels, where it leaves no structure that passes for a level."""
     record, scanner = with_variance(session.record, white), session.scanner
     try:
-        baseline = fit_record(record, model)
+        baseline = fit_record(record, model, start=_counted(session.baseline))
     except EstimateError:
         return None
     kept = {"outliers": scanner.outliers, "stated": baseline.noise_given, "step": scanner.step}
@@ -212,6 +214,11 @@ def over_weighted(
     again = Session(weighted, baseline, session.threshold)
     selection = again.run(say)
     return None if selection.unfinished else (again, selection)
+
+
+def _counted(baseline: Estimate) -> NoiseRatios | None:
+    """The noise to begin with where a fit has white noise of the angle, which may show only beside what is found."""
+    return None if baseline.ratios.quantisation is None else baseline.ratios
 
 
 def _grid(record: Record, baseline: Estimate) -> NoiseGrid:

@@ -77,7 +77,7 @@ class Growth(NamedTuple):
         if name is None:
             return None
         values = FORMS[name](np.asarray(record.signals[name])[: record.rows])
-        return Level(name, float(values.min()), float(values.max()))
+        return Level(name, float(values.min()), float(values.max()), self.ratio)
 
 
 def growing_noise(record: Record, estimate: Estimate) -> Growth | None:

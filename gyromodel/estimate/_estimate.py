@@ -134,6 +134,9 @@ def noise_table(model: GyroModel, intervals: Mapping[str, tuple[float, float]]) 
         scale = factor(internal_unit(unit), unit)
         low, high = intervals.get(name, (value, value))
         rows[name] = {"value": value * scale, "lo": low * scale, "hi": high * scale, "unit": unit}
+    if (level := model.level) is not None:
+        low, high = intervals.get("noise_heteroscedastic", (level.ratio, level.ratio))
+        rows["noise_heteroscedastic"] = {"value": level.ratio, "lo": low, "hi": high, "unit": "1"}
     return rows
 
 

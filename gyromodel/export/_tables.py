@@ -81,6 +81,7 @@ def _noise(calibration: Calibration) -> list[Entry]:
         unit = noise_units(calibration.model.noise_of)[name]
         found.append(Entry(effect, "noise", what, float(from_internal(x, unit)), math.nan, unit, float(x)))
     if (level := calibration.model.level) is not None:
+        found.append(Entry("noise_heteroscedastic", "noise", "value", level.ratio, math.nan, "1", level.ratio))
         unit = LEVEL_UNITS[level.driver]
         for end, x in (("from", level.low), ("to", level.high)):
             what, value = f"{level.driver} {end}", float(from_internal(x, unit))

@@ -33,7 +33,6 @@ NOISE_UNITS = {
         "noise_random_walk",
         "noise_markov",
         "noise_quantisation",
-        "noise_heteroscedastic",
         "noise_telegraph",
     )
 } | dict.fromkeys(TIMES, "s")
@@ -169,14 +168,14 @@ def check_stated(noise: Mapping[str, Any]) -> None:
     """Refuse (ValueError) a statement without white noise, or of Markov noise without its time or beside flicker."""
     if float(noise.get("noise_white", 0.0)) <= 0:
         raise ValueError("noise needs a noise_white above zero")
-    if float(noise.get("noise_heteroscedastic", 1.0)) <= 0:
-        raise ValueError("noise_heteroscedastic is a ratio of noise levels, and above zero")
     if float(noise.get("noise_markov", 0.0)):
         if float(noise.get("noise_flicker", 0.0)):
             raise ValueError("noise_flicker and noise_markov cannot stand side by side; state one of them")
         if float(noise.get(MARKOV_TIME, 0.0)) <= 0:
             raise ValueError("noise_markov needs a time_constant above zero")
-    if float(noise.get("noise_telegraph", 0.0)):
+    if "noise_telegraph" in noise:
+        if float(noise["noise_telegraph"]) <= 0:
+            raise ValueError("noise_telegraph needs a size above zero")
         if float(noise.get("noise_flicker", 0.0)) or float(noise.get("noise_markov", 0.0)):
             raise ValueError("noise_telegraph cannot stand beside noise_flicker or noise_markov; state one of them")
         if not all(float(noise.get(name, 0.0)) > 0 for name in TELEGRAPH_TIMES):

@@ -22,6 +22,7 @@ _NOISE = {
     "noise_flicker": "flicker",
     "noise_random_walk": "random walk",
     "noise_markov": "Markov noise",
+    "noise_quantisation": "counts of the angle",
 }
 
 
