@@ -53,7 +53,7 @@ def write_page(output: Path, whole: list[Kept]) -> None:
     size, error = levels.mean_set_size(sized[3.0])
     at_three = sum(r.isolable for r in sized[3.0])
     told = {label: [t for k in whole for t in k.oracle.get(label, [])] for label in parts}
-    controls, control_checks = _controls(nulls, sized[3.0], unknown[3.0])
+    controls, control_checks = _controls(nulls, sized[3.0], parts["unknown 3"])
     tenth = binomtest(round(lowest * count), count, 0.1).pvalue > 0.05
     small, three = size - 1.96 * error <= levels.SET_SIZE, f"{size:.2f} ± {error:.2f}"
     mutants, mutant_checks = _mutants(parts)
