@@ -367,8 +367,10 @@ def test_exact_outputs_of_even_rates_are_no_steps():
     assert (found.verdict, found.causes) == ("adequate", ())
 
 
-@pytest.mark.parametrize("hidden", ["", "bias_temperature", "scale_nonlinearity", "bias_periodic"])
-@pytest.mark.parametrize("scale", [1.001, 1234.5])
+@pytest.mark.parametrize(
+    ("hidden", "scale"),
+    [("", 1.001), ("bias_temperature", 1234.5), ("scale_nonlinearity", 1.001), ("bias_periodic", 1234.5)],
+)
 def test_data_without_noise_show_what_is_hidden_and_no_rounding_of_doubles(
     hidden: str, scale: float, rng: np.random.Generator
 ):
