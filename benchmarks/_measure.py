@@ -9,11 +9,13 @@ import resource
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+
+from scipy.stats import beta
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = Path(__file__).parent / "results"
@@ -72,6 +74,14 @@ def in_fresh_process(module: str, *arguments: str, **environment: str) -> Any:
         check=True,
     )
     return json.loads(done.stdout.splitlines()[-1])
+
+
+def share(flags: Sequence[bool] | int, of: int = 0) -> str:
+    """How many of some are true, with the 95 % Clopper-Pearson interval; or so many of a number."""
+    hits, of = (flags, of) if isinstance(flags, int) else (sum(flags), len(flags))
+    low = beta.ppf(0.025, hits, of - hits + 1) if hits else 0.0
+    high = beta.ppf(0.975, hits + 1, of - hits) if hits < of else 1.0
+    return f"{hits} of {of} ({100 * low:.0f}-{100 * high:.0f} %)"
 
 
 def table(head: list[str], rows: list[list[str]]) -> list[str]:

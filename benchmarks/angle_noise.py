@@ -17,9 +17,8 @@ from unittest.mock import patch
 
 import numpy as np
 
-from benchmarks._measure import table, write_result
+from benchmarks._measure import share, table, write_result
 from tests.truth import noise as truth
-from tests.truth.levels import Level
 
 ROWS, STEP = 900, 10.0
 WHITE = np.deg2rad(0.002) / 60.0  # rad/sqrt(s)
@@ -76,12 +75,6 @@ def known(seed: int, counts: float, told: bool) -> Known:
     return Known(error / best, float(estimate.std[1]) / best, white, causes, falsely)
 
 
-def _share(flags: list[bool]) -> str:
-    level = Level("", "", "", 0.0, True, sum(flags), len(flags))
-    low, high = (100 * end for end in level.interval)
-    return f"{level.count} of {level.total} ({low:.0f}-{high:.0f} %)"
-
-
 def main(argv: list[str] | None = None) -> None:
     argv = sys.argv[1:] if argv is None else argv
     parser = argparse.ArgumentParser(description="A counted angle.")
@@ -101,10 +94,10 @@ def main(argv: list[str] | None = None) -> None:
                         "yes" if told else "no",
                         f"{np.sqrt(np.mean([k.error**2 for k in each])):.2f}",
                         f"{np.median([k.std for k in each]):.2f}",
-                        _share(inside),
+                        share(inside),
                         f"{np.median([k.white for k in each]):.2f}",
-                        _share(["bias_temperature" in k.causes for k in each]),
-                        _share([bool(k.falsely) for k in each]),
+                        share(["bias_temperature" in k.causes for k in each]),
+                        share([bool(k.falsely) for k in each]),
                     ]
                 )
     head = [

@@ -13,9 +13,8 @@ import sys
 
 import numpy as np
 from scipy.optimize import nnls
-from scipy.stats import beta
 
-from benchmarks._measure import table, timed, write_result
+from benchmarks._measure import share, table, timed, write_result
 
 ROWS, STEP = 216_000, 0.1
 N, K, B = 3e-3, 2e-6, 3e-4  # deg/s/sqrt(Hz), deg/s^1.5, deg/s
@@ -68,13 +67,6 @@ def _oracle(log: np.ndarray) -> tuple[float, float]:
     return float(x[WHITE] * np.sqrt(STEP)), float(x[WALK])
 
 
-def _share(hits: int, of: int) -> str:
-    """A share with its 95 % Clopper-Pearson interval."""
-    low = beta.ppf(0.025, hits, of - hits + 1) if hits else 0.0
-    high = beta.ppf(0.975, hits + 1, of - hits) if hits < of else 1.0
-    return f"{hits} of {of} ({100 * low:.0f} to {100 * high:.0f} %)"
-
-
 def main(argv: list[str] | None = None) -> None:
     argv = sys.argv[1:] if argv is None else argv
     parser = argparse.ArgumentParser(description="Errors of noise coefficients.")
@@ -117,7 +109,7 @@ def main(argv: list[str] | None = None) -> None:
         for truth, of in verdicts.items()
         for key in ids
     ]
-    coverage = [[truth, *(_share(int(hits), len(of)) for hits in np.sum(of, axis=0))] for truth, of in covered.items()]
+    coverage = [[truth, *(share(int(hits), len(of)) for hits in np.sum(of, axis=0))] for truth, of in covered.items()]
     lines = [
         f"{seeds} logs of each kind, 6 h at 10 Hz: N = {N:g} deg/s/√Hz, with K = {K:g} deg/s^1.5, alone, or with "
         f"B = {B:g} deg/s. One identification with its intervals took {np.median(seconds):.1f} s (median of "

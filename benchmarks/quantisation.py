@@ -15,9 +15,8 @@ from unittest.mock import patch
 
 import numpy as np
 
-from benchmarks._measure import table, write_result
+from benchmarks._measure import share, table, write_result
 from tests.truth import study
-from tests.truth.levels import Level
 from tests.truth.memory import rounded
 from tests.truth.verdicts import Score, judge
 
@@ -89,12 +88,6 @@ def fits(steps: float, seed: int) -> list[list[str]]:
     return [[*row, f"{rms[''] / rms[NAME]:.2f}"]]
 
 
-def _share(flags: list[bool]) -> str:
-    level = Level("", "", "", 0.0, True, sum(flags), len(flags))
-    low, high = (100 * end for end in level.interval)
-    return f"{level.count} of {level.total} ({low:.0f}-{high:.0f} %)"
-
-
 def main(argv: list[str] | None = None) -> None:
     argv = sys.argv[1:] if argv is None else argv
     parser = argparse.ArgumentParser(description="Outputs that are read in steps.")
@@ -113,12 +106,12 @@ def main(argv: list[str] | None = None) -> None:
                 scored = [(a.told, a.score) for a in answers if a.score]
                 scores = [s for _, s in scored]
                 right = [s.right for s in scores]
-                told = _share([told for told, _ in scored])
+                told = share([told for told, _ in scored])
                 wrong = sum(s.firm_and_wrong or (s.called_unknown and cases is nothing) for s in scores)
                 among = str(sum(s.in_set and not s.named for s in scores)) if cases is hidden else ""
                 knows = "no" if blind else "yes"
                 unknown = sum(s.called_unknown for s in scores)
-                rows.append([f"{steps:g}", what, knows, told, _share(right), among, str(wrong), str(unknown)])
+                rows.append([f"{steps:g}", what, knows, told, share(right), among, str(wrong), str(unknown)])
                 print(*rows[-1], sep=" | ", flush=True)
     fitted = [row for steps in (0.5, *STEPS, 30.0) for row in fits(steps, arguments.seed)]
     lines = [

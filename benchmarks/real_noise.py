@@ -17,11 +17,10 @@ from functools import cache, partial
 
 import numpy as np
 
-from benchmarks._measure import DATA, table, write_result
+from benchmarks._measure import DATA, share, table, write_result
 from tests.truth import study
 from tests.truth.campaigns import TESTABLE, A, B, C
 from tests.truth.designs import Design
-from tests.truth.levels import Level
 from tests.truth.noise import Noise
 from tests.truth.verdicts import Score, allowed, judge
 
@@ -101,12 +100,6 @@ def judged(record: study.Record) -> Score:
     return judge(record.truth, record.case.design, answer, record.isolable or record.case.effect is None)
 
 
-def _share(flags: list[bool]) -> str:
-    level = Level("", "", "", 0.0, True, sum(flags), len(flags))
-    low, high = (100 * end for end in level.interval)
-    return f"{level.count} of {level.total} ({low:.0f}-{high:.0f} %)"
-
-
 def _beside_dither(record: study.Record) -> bool | None:
     """Of an answer that is unknown in the noise of a dither, whether what it names is right; none of others."""
     answer = record.answer
@@ -132,16 +125,16 @@ def main(argv: list[str] | None = None) -> None:
         records = run(drawn, controls=("least_squares_f", "stepwise_bic") if times is None else ())
         scores = [judged(r) for r in records]
         if times is None:
-            rows.append(["nothing hidden: something found", _share([s.detected for s in scores])])
+            rows.append(["nothing hidden: something found", share([s.detected for s in scores])])
             for control, name in (("least_squares_f", "an F-test of each candidate"), ("stepwise_bic", "stepwise BIC")):
-                rows.append([f"the same by {name}", _share([bool(r.controls[control].added) for r in records])])
+                rows.append([f"the same by {name}", share([bool(r.controls[control].added) for r in records])])
         else:
-            rows.append([f"{times:g}×: right verdict", _share([s.right for s in scores])])
+            rows.append([f"{times:g}×: right verdict", share([s.right for s in scores])])
             alone = [s.named for r, s in zip(records, scores, strict=True) if r.isolable]
-            rows.append([f"{times:g}×, isolable: named, and nothing else", _share(alone)])
-            rows.append([f"{times:g}×: firm and wrong", _share([s.firm_and_wrong for s in scores])])
+            rows.append([f"{times:g}×, isolable: named, and nothing else", share(alone)])
+            rows.append([f"{times:g}×: firm and wrong", share([s.firm_and_wrong for s in scores])])
             beside = [_beside_dither(r) for r in records]
-            rows.append([f"{times:g}×: unknown, in the ring laser's log", _share([b is not None for b in beside])])
+            rows.append([f"{times:g}×: unknown, in the ring laser's log", share([b is not None for b in beside])])
             rows.append([f"{times:g}×: of these, the right name and no other stands beside", str(beside.count(True))])
         for r, s in zip(records, scores, strict=True):
             if r.answer and (s.firm_and_wrong or (times is None and s.detected)):

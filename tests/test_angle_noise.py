@@ -120,6 +120,7 @@ def test_stated_white_noise_alone_lacks_it(rng: np.random.Generator):
     model = replace(gm.model_from_effects(["bias"]), noise={"noise_white": np.sqrt(N**2 + 2.0 * Q**2 / STEP)})
     found = gm.diagnose(counted(rng), model, hold_out=False)
     assert "noise_quantisation" in {c.effect for c in found.causes}
+    assert gm.diagnose(counted(rng), found.extended.model, hold_out=False).verdict == "adequate"
 
 
 def test_many_fits_are_those_of_one_by_one(rng: np.random.Generator):

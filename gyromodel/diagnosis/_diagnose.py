@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
 
-import jax.numpy as jnp
 import numpy as np
 
 from gyromodel._checks import listed
-from gyromodel._noise_level import with_level, with_stated_level
+from gyromodel._noise_level import with_stated_level
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._calibrate import null_scores, threshold_of
 from gyromodel.diagnosis._data import Data, read
+from gyromodel.diagnosis._extended import finished, stated_counts, stated_hops, stated_level
 from gyromodel.diagnosis._gain import nested_gain, no_gain, not_measured
 from gyromodel.diagnosis._intervals import CLEARER, COUNTED, HALF, over_intervals
 from gyromodel.diagnosis._isolation import settling_test
@@ -35,7 +34,7 @@ from gyromodel.diagnosis._session import (
 )
 from gyromodel.diagnosis._shapes import driver_shape, minimum_detectable, not_testable
 from gyromodel.diagnosis._steps import Found
-from gyromodel.diagnosis._variance import Growth, follow, growing_noise, noise_level, tails
+from gyromodel.diagnosis._variance import follow, growing_noise, noise_level, tails
 from gyromodel.diagnosis._verdict import FAINT, judge, structured, with_noise, with_steps
 from gyromodel.estimate import (
     Estimate,
@@ -44,19 +43,15 @@ from gyromodel.estimate import (
     fit_record,
     refuse_apart,
     refuse_missing,
-    with_noise_intervals,
     with_reading,
 )
-from gyromodel.model import GyroModel, Level
-from gyromodel.noise import MARKOV_TIME, TELEGRAPH_TIMES
+from gyromodel.model import GyroModel
 from gyromodel.signals import with_columns_known
-from gyromodel.units import factor, from_internal, internal_unit
+from gyromodel.units import factor, from_internal
 
 FEWEST_DRAWS = 200
 # Searches beside rounding as it is at what the last has found.
 ROUNDINGS = 3
-# What fits take hops of the bias for.
-STANDS_FOR_HOPS = ("noise_flicker", "noise_markov", MARKOV_TIME)
 # Folds search the noise cells within this many nats of the best of the main pass.
 FOLD_NEARBY = 3.0
 SMOOTHED = (
@@ -193,7 +188,7 @@ def diagnose(
     names = session.scanner.bank.names()
     scale = factor(record.input_unit, unit)
     ordinary = tuple(hold_out and session.ladder(e)[2] for e in (baseline, selection.estimate))
-    extended = _finished(selection.estimate, ordinary[1])
+    extended = finished(selection.estimate, ordinary[1])
     weights = ordinary[0], extended.ordinary
     extended = readings.widened(as_it_was, extended, rounding)
     if extended.ordinary:
@@ -206,7 +201,7 @@ def diagnose(
     # What follows itself at one end of a column has structure, whatever faint name takes a part of it.
     if following and grows and all(c.statistic < FAINT for c in judgement.causes):
         judgement = structured(judgement, selection.last, grows.column)
-    stepped = None
+    stepped = free = None
     if plain and not selection.unfinished and (free := _with_noise_estimated(selection.estimate)):
         stepped = quantisation(free, session.threshold, last if last.noise_given else None)
     if stepped is not None:
@@ -242,10 +237,12 @@ def diagnose(
         extended = with_reading(extended, steps, given, as_it_was)
     if reading:
         baseline = with_reading(baseline, reading, given, as_it_was)
+    if stepped is not None and free and last.noise_given:
+        extended = stated_counts(extended, free)
     if grows and record.domain == "gyro" and (level := grows.level(record)):
-        extended = _following(extended, grows, level)
+        extended = stated_level(extended, grows, level)
     if hops is not None:
-        extended = _hopping(extended, hops)
+        extended = stated_hops(extended, hops)
     next_test = judgement.next_test
     if judgement.verdict == "ambiguous":
         alike = list(judgement.credible_set)
@@ -324,33 +321,6 @@ def _refuse_missing(measured: Sequence[Campaign], data: Data, model: GyroModel) 
         for effect in model.effects:
             for name in set(model.columns_needed(effect)) & set(campaign.columns):
                 refuse_missing(effect.label, name, campaign.columns[name], np.isfinite(campaign.columns["output"]))
-
-
-def _finished(estimate: Estimate, ordinary: bool) -> Estimate:
-    """What is published: the last fit, with ordinary weights where they predict better and determine it too."""
-    if ordinary:
-        with contextlib.suppress(EstimateError):
-            estimate = fit_record(estimate.record, estimate.model_as_given(), ordinary=True)
-    return with_noise_intervals(estimate)
-
-
-def _hopping(estimate: Estimate, hops: Cause) -> Estimate:
-    """The fit with hops of the bias as its model states them, in the place of the noise that stood for them."""
-    kept = {name: v for name, v in estimate.model.noise.items() if name not in (*STANDS_FOR_HOPS, *TELEGRAPH_TIMES)}
-    names = ("noise_telegraph", *TELEGRAPH_TIMES)
-    values = [p.value * factor(p.unit, internal_unit(p.unit)) for p in hops.parameters]
-    noise = kept | {name: jnp.asarray(value) for name, value in zip(names, values, strict=True)}
-    return replace(estimate, model=replace(estimate.model, noise=noise))
-
-
-def _following(estimate: Estimate, grows: Growth, level: Level) -> Estimate:
-    """The fit with what its noise level follows as its model states it."""
-    model = with_level(estimate.model, level)
-    if model is estimate.model or model.level is None:
-        return estimate
-    ratio, spread = model.level.ratio, float(np.exp(1.96 * grows.ratio_std / grows.ratio))
-    interval = {**estimate.noise_interval, "noise_heteroscedastic": (ratio / spread, ratio * spread)}
-    return replace(estimate, model=model, noise_interval=interval)
 
 
 def _with_noise_estimated(estimate: Estimate) -> Estimate | None:
