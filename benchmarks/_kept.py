@@ -23,8 +23,8 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # What of the package diagnoses a campaign of a gyro: a study goes on where none of this has changed.
 ENGINE = (
-    "_output_rate.py", "averages.py", "campaign.py", "diagnosis", "effects", "estimate", "model.py", "noise",
-    "numerics", "poses.py", "signals.py", "units.py",
+    "_noise_level.py", "_output_rate.py", "averages.py", "campaign.py", "diagnosis", "effects", "estimate", "model.py",
+    "noise", "numerics", "poses.py", "signals.py", "units.py",
 )  # fmt: skip
 
 

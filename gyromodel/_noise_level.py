@@ -19,6 +19,9 @@ FORMS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "time": np.asarray,
 }
 
+# Values of a column at which two laws of its levels are joined.
+JOINED = 201
+
 
 def relative_variance(level: Level, values: np.ndarray) -> np.ndarray:
     """White variance at values of a level's column, over that halfway; beyond its ends as there.
@@ -58,21 +61,22 @@ def with_stated_level(record: Record, model: GyroModel) -> Record:
     return record._replace(sampling=record.sampling._replace(white=jnp.asarray(white)))
 
 
-def with_level(model: GyroModel, level: Level) -> GyroModel:
-    """A fitted model with a level that its noise follows, beside one of the same column that it has already.
+def with_level(model: GyroModel, level: Level) -> tuple[GyroModel, float]:
+    """A fitted model with a level found beside the one it may have already, and by what its white noise is multiplied.
 
-    One of another column, or of a part of this one's range, stays as it is, as one alone can be stated.
+    Of one column both are one law over the range that was found; of another only one can be stated, and that stays.
     """
     had = model.level
     if had is None:
-        return replace(model, level=level)
-    if had.driver != level.driver or not had.low <= level.low < level.high <= had.high:
-        return model
-    slope = np.log(had.ratio) / (had.high - had.low)
-    ratio = level.ratio * float(np.exp(slope * (level.high - level.low)))
-    # White noise is that halfway, which is elsewhere now.
-    middle = 0.5 * (level.low + level.high) - 0.5 * (had.low + had.high)
-    noise = dict(model.noise)
+        return replace(model, level=level), 1.0
+    if had.driver != level.driver:
+        return model, 1.0
+    # The straight line through the sum of both; where the first ends within the range it is nearly one.
+    at = np.linspace(level.low, level.high, JOINED)
+    log = 0.5 * np.log(relative_variance(had, at) * relative_variance(level, at))
+    slope, middle = np.polyfit(at - 0.5 * (level.low + level.high), log, 1)
+    noise, more = dict(model.noise), float(np.exp(middle))
     if "noise_white" in noise:
-        noise["noise_white"] = noise["noise_white"] * float(np.exp(slope * middle))
-    return replace(model, level=level._replace(ratio=ratio), noise=noise)
+        noise["noise_white"] = noise["noise_white"] * more
+    ratio = float(np.exp(slope * (level.high - level.low)))
+    return replace(model, level=level._replace(ratio=ratio), noise=noise), more

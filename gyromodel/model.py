@@ -93,7 +93,9 @@ class GyroModel(eqx.Module):
         if (level := self.level) is not None:
             if level.driver not in LEVEL_UNITS or not level.low < level.high:
                 raise ModelError("noise_heteroscedastic needs what it follows, from a value to a larger one")
-            if not level.ratio > 0:
+            if self.noise_of != "gyro" or any(effect.domain != "gyro" for effect in self.effects):
+                raise ModelError("noise_heteroscedastic is of a gyro's rate")
+            if not 0.0 < level.ratio < float("inf"):
                 raise ModelError("noise_heteroscedastic is a ratio of noise levels, and above zero")
         kinds: dict[str, str] = {e.domain: e.label for e in self.effects} | (
             {self.noise_of: "noise"} if self.noise else {}

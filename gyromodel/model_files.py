@@ -282,6 +282,8 @@ def _read_noise(place: Place, of: list[Domain]) -> tuple[dict[str, float], Domai
             noise[of_kind] = entry[key].number_in(NOISE_UNITS[of_kind])
         if extra := next((key for key in LEVEL_KEYS if key in entry), None):
             raise entry[extra].error(f"{name} has no {extra}")
+    if level is not None and not noise:
+        return noise, of[0], level
     try:
         check_stated(noise)
     except ValueError as problem:

@@ -172,8 +172,10 @@ def test_kinds_of_noise_that_are_not_stated_are_causes():
         found = gm.diagnose(log(output), stated(), hold_out=False)
         assert (found.verdict, [c.effect for c in found.causes]) == ("named", [name])
         assert set(found.credible_set) == {name}
-        # Hops are no noise of the stated kind alone: what is published weighs them.
-        assert (set(found.extended.model.noise) > {"noise_white"}) == (name == "noise_telegraph")
+        extended = found.extended.model
+        assert {name} <= {*extended.noise, *(["noise_heteroscedastic"] if extended.level else [])}
+        # Hops and counts are no noise of the stated kind alone: what is published weighs them.
+        assert (set(extended.noise) > {"noise_white"}) == (name != "noise_heteroscedastic")
         free = gm.diagnose(log(output), gm.model_from_effects(["bias"]), hold_out=False)
         assert [c.effect for c in free.causes] == ([name] if name == "noise_telegraph" else [])
         assert any(sentence in line for line in (*free.findings, ""))

@@ -128,7 +128,7 @@ def test_more_than_is_stated_beside_a_walk_that_is_not_is_stated_with_it(rng: np
 
 def test_a_level_in_a_part_of_a_range_is_joined_to_that_of_the_whole(rng: np.random.Generator):
     model = replace(stated(1.0), level=Level("temperature", 0.0, 60.0, 4.0))
-    joined = with_level(model, Level("temperature", 10.0, 30.0, 3.0))
+    joined, more = with_level(model, Level("temperature", 10.0, 30.0, 3.0))
     at = np.linspace(10.0, 30.0, 7)
     assert model.level is not None
     assert joined.level is not None
@@ -137,8 +137,27 @@ def test_a_level_in_a_part_of_a_range_is_joined_to_that_of_the_whole(rng: np.ran
         relative_variance(joined.level, at) * float(joined.noise["noise_white"] / model.noise["noise_white"]) ** 2
     )
     assert together == pytest.approx(apart, rel=1e-9)
+    assert more == pytest.approx(float(joined.noise["noise_white"] / model.noise["noise_white"]))
     other = Level("rate", 0.0, 1.0, 3.0)
-    assert with_level(model, other).level == model.level
+    assert with_level(model, other)[0].level == model.level
+
+
+@pytest.mark.law
+def test_a_level_that_goes_on_beyond_what_is_stated_is_stated(tmp_path: Path, rng: np.random.Generator):
+    model = replace(stated(1.5), level=Level("rate", 0.0, np.deg2rad(50.0), 1.5))
+    found = gm.diagnose(campaign(rng, 8.0), model, hold_out=False)
+    assert "noise_heteroscedastic" in {c.effect for c in found.causes}
+    gm.write_model(found.extended, tmp_path / "extended.yaml")
+    extended = gm.read_model(tmp_path / "extended.yaml")
+    assert gm.diagnose(campaign(rng, 8.0), extended, hold_out=False).verdict == "adequate"
+
+
+def test_a_level_alone_has_the_rest_estimated(tmp_path: Path, rng: np.random.Generator):
+    model = replace(stated(4.0), noise={})
+    gm.write_model(model, tmp_path / "model.yaml")
+    again = gm.read_model(tmp_path / "model.yaml")
+    assert (again.level, dict(again.noise)) == (model.level, {})
+    assert float(gm.fit(campaign(rng, 4.0), again).model.noise["noise_white"]) == pytest.approx(N, rel=0.1)
 
 
 def test_a_calibration_without_the_column_of_its_level_tells_rates_without_scatter(rng: np.random.Generator):

@@ -201,9 +201,14 @@ def diagnose(
     # What follows itself at one end of a column has structure, whatever faint name takes a part of it.
     if following and grows and all(c.statistic < FAINT for c in judgement.causes):
         judgement = structured(judgement, selection.last, grows.column)
-    stepped = free = None
+    stepped = free = band = None
     if plain and not selection.unfinished and (free := _with_noise_estimated(selection.estimate)):
         stepped = quantisation(free, session.threshold, last if last.noise_given else None)
+    if plain and not selection.unresolved and (band := excess_band(free or selection.estimate)):
+        findings.append(band.told)
+    # Where a band is left besides, neighbours fall apart otherwise than a count's errors do.
+    if stepped is not None and band is not None:
+        stepped = None
     if stepped is not None:
         beyond.append(stepped)
         size = stepped.parameters[0].value
@@ -212,8 +217,6 @@ def diagnose(
             "angle)"
             + ("; fits in the noise that is stated take it as white noise of the rate." if last.noise_given else ".")
         )
-    elif plain and not selection.unresolved and (band := excess_band(selection.estimate)):
-        findings.append(band)
     # Where the simulation leaves its noise to be estimated, its kinds are no discrepancy, but for what no fit holds.
     judgement = with_noise(
         judgement,
@@ -241,6 +244,8 @@ def diagnose(
         extended = stated_counts(extended, free)
     if grows and record.domain == "gyro" and (level := grows.level(record)):
         extended = stated_level(extended, grows, level)
+        if extended.model.level and extended.model.level.driver != level.driver:
+            findings.append(f"A model states one column that its noise follows: not {grows.driver} besides.")
     if hops is not None:
         extended = stated_hops(extended, hops)
     next_test = judgement.next_test

@@ -149,8 +149,8 @@ def steady(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[list[F
     if not changing:
         return found, estimate, ""
     places = " and ".join(f"{frequency:.4g} Hz" for frequency in sorted(changing))
-    said = f"What oscillates near {places} changes its size or its frequency: it is no steady line, and is not named."
-    return found, estimate, said
+    changes = "changes its size or its frequency, or is noise: it is no steady line, and is not named."
+    return found, estimate, f"What oscillates near {places} {changes}"
 
 
 def uncontested(step: Found) -> bool:

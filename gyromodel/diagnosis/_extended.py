@@ -16,8 +16,8 @@ from gyromodel.model import Level
 from gyromodel.noise import MARKOV_TIME, TELEGRAPH_TIMES
 from gyromodel.units import factor, internal_unit
 
-# What fits take hops of the bias for.
-STANDS_FOR_HOPS = ("noise_flicker", "noise_markov", MARKOV_TIME)
+# What fits take hops of the bias for: about their two levels the noise was white.
+STANDS_FOR_HOPS = ("noise_flicker", "noise_random_walk", "noise_markov", MARKOV_TIME)
 
 
 def finished(estimate: Estimate, ordinary: bool) -> Estimate:
@@ -38,18 +38,23 @@ def stated_counts(estimate: Estimate, free: Estimate) -> Estimate:
 
 def stated_hops(estimate: Estimate, hops: Cause) -> Estimate:
     """The fit with hops of the bias as its model states them, in the place of the noise that stood for them."""
-    kept = {name: v for name, v in estimate.model.noise.items() if name not in (*STANDS_FOR_HOPS, *TELEGRAPH_TIMES)}
-    names = ("noise_telegraph", *TELEGRAPH_TIMES)
-    values = [p.value * factor(p.unit, internal_unit(p.unit)) for p in hops.parameters]
-    noise = kept | {name: jnp.asarray(value) for name, value in zip(names, values, strict=True)}
-    return replace(estimate, model=replace(estimate.model, noise=noise))
+    noise = {name: v for name, v in estimate.model.noise.items() if name not in STANDS_FOR_HOPS}
+    intervals = {name: v for name, v in estimate.noise_interval.items() if name in noise}
+    for name, p in zip(("noise_telegraph", *TELEGRAPH_TIMES), hops.parameters, strict=True):
+        scale = factor(p.unit, internal_unit(p.unit))
+        noise[name] = jnp.asarray(p.value * scale)
+        intervals[name] = max(p.value - 1.96 * p.std, 0.0) * scale, (p.value + 1.96 * p.std) * scale
+    return replace(estimate, model=replace(estimate.model, noise=noise), noise_interval=intervals)
 
 
 def stated_level(estimate: Estimate, grows: Growth, level: Level) -> Estimate:
     """The fit with what its noise level follows as its model states it."""
-    model = with_level(estimate.model, level)
+    model, more = with_level(estimate.model, level)
     if model is estimate.model or model.level is None:
         return estimate
     ratio, spread = model.level.ratio, float(np.exp(1.96 * grows.ratio_std / grows.ratio))
     interval = {**estimate.noise_interval, "noise_heteroscedastic": (ratio / spread, ratio * spread)}
+    if "noise_white" in interval:
+        low, high = interval["noise_white"]
+        interval["noise_white"] = low * more, high * more
     return replace(estimate, model=model, noise_interval=interval)

@@ -7,6 +7,8 @@ that changes is fitted by its mean, and the rest of it is left, like whatever os
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.polynomial.legendre import legvander
 from scipy.stats import chi2, f, norm
@@ -29,6 +31,23 @@ NARROWEST, EXCESS = 8, 1.25
 TAIL = 4.0
 # Runs whose intervals differ by more than this ratio have no frequencies in common.
 UNLIKE = 1.1
+
+
+class Band(NamedTuple):
+    """A band of frequencies (Hz) that holds more than the fitted noise, and its power over that of the others."""
+
+    low: float
+    high: float
+    ratio: float
+
+    @property
+    def told(self) -> str:
+        """What is said of it."""
+        return (
+            f"Noise of the fitted kinds does not explain what is left from {self.low:.3g} to {self.high:.3g} Hz, with "
+            f"{self.ratio:.2g} times the power of the rest: something oscillates there that is no steady line, or it "
+            "is noise of another kind."
+        )
 
 
 def unexplained_axes(estimate: Estimate) -> list[str]:
@@ -61,7 +80,10 @@ def axis_probabilities(estimate: Estimate) -> dict[str, float]:
 
 
 def unsteady_lines(estimate: Estimate) -> list[bool]:
-    """Whether each line of a model has, or may have, another size or frequency at other times of its campaign."""
+    """Whether each line of a model has, or may have, another size or frequency at other times of its campaign.
+
+    So may one that is no larger than what a band of unexplained noise about it makes.
+    """
     model, record, lines = estimate.model, estimate.record, lines_of(estimate.model)
     if not lines:
         return []
@@ -82,6 +104,7 @@ def unsteady_lines(estimate: Estimate) -> list[bool]:
     columns = columns / np.linalg.norm(columns, axis=0)
     taken = np.linalg.qr(columns[:, :p])[0]
     residual, values, found = estimate.whitened[record.present], np.asarray(model.vector()), []
+    band = excess_band(estimate)
     slots = list(enumerate(model.slots()))
     for k in range(len(lines)):
         wave = columns[:, p + 2 * BENDS * k :][:, : 2 * BENDS]
@@ -92,12 +115,14 @@ def unsteady_lines(estimate: Estimate) -> list[bool]:
         steady = values[own] @ np.linalg.solve(estimate.covariance[np.ix_(own, own)], values[own])
         seldom = chi2.sf(changing, left.shape[1]) * len(lines) < SELDOM
         beside = any(near(lines[k], other, NEAR / record.span) for other in lines[:k] + lines[k + 1 :])
-        found.append(beside or bool(seldom and changing > UNSTEADY * (changing + steady)))
+        raised = band.ratio if band is not None and band.low <= lines[k].frequency <= band.high else 0.0
+        made = raised and chi2.sf(steady / raised, 2) * record.rows / 2 > SELDOM
+        found.append(beside or bool(made or (seldom and changing > UNSTEADY * (changing + steady))))
     return found
 
 
-def excess_band(estimate: Estimate) -> str:
-    """A sentence where some band of frequencies has more power than the fitted noise gives it; empty where none has.
+def excess_band(estimate: Estimate) -> Band | None:
+    """The band of frequencies that has more power than the fitted noise gives it, beyond chance; None where none has.
 
     Nothing is said of runs of unlike intervals, which have no frequencies in common.
     Bands are halves, quarters and so on of all frequencies, overlapping by half; their number is paid for.
@@ -107,12 +132,14 @@ def excess_band(estimate: Estimate) -> str:
     each = [np.diff(time[run == k]) for k in np.unique(run)]
     steps = [np.median(step) for step in each if len(step) >= NARROWEST]
     if steps and max(steps) > UNLIKE * min(steps):
-        return ""
+        return None
     residual = estimate.whitened[record.present]
     most = TAIL * float(np.median(np.abs(residual))) / norm.isf(0.25)
     if not most > 0.0:
-        return ""
-    residual = np.clip(residual, -most, most)
+        return None
+    if estimate.ratios.quantisation is None:
+        # Counts have tails of their own: less of these would fall apart less.
+        residual = np.clip(residual, -most, most)
     count = (len(residual) - 1) // 2
     total = np.concatenate([[0.0], np.cumsum(np.abs(np.fft.rfft(residual))[1 : count + 1] ** 2)])
     bands, width = [(1.0, 1.0, 0, 0)], count // 2
@@ -124,10 +151,6 @@ def excess_band(estimate: Estimate) -> str:
         width //= 2
     seldom, ratio, *ends = min(bands)
     if seldom * len(bands) > SELDOM or ratio < EXCESS:
-        return ""
+        return None
     low, high = (k / (len(residual) * record.interval) for k in ends)
-    return (
-        f"Noise of the fitted kinds does not explain what is left from {low:.3g} to {high:.3g} Hz, with {ratio:.2g} "
-        "times the power of the rest: something oscillates there that is no steady line, or it is noise of another "
-        "kind."
-    )
+    return Band(low, high, ratio)

@@ -16,7 +16,7 @@ STRETCH = 16
 # It is looked for where neighbours have so many standard deviations less in common than nothing.
 CORRELATED = 3.0
 # Quantisation variances over white ones that are tried.
-SHARES = np.geomspace(1e-3, 1e3, 61)
+SHARES = np.geomspace(1e-3, 1e7, 61)
 # Times the variance that a line has at its frequency, parts of the frequencies that may be lines, turns of their fit.
 LINE, LINES, TURNS = 20.0, (1e-6, 0.01, 0.03, 0.1), 20
 # Where a band may begin, in the units of quantisation's spectrum (0.1 to 0.45 times the sample rate), and by how much.

@@ -27,7 +27,7 @@ ANGLE_LEAD = 4.0
 # Levels of each noise ratio over its likely range, for the intervals of the noise coefficients, and between them; of
 # white noise of the angle, which is told from the others by its frequencies, fewer, within such factors at first.
 INTERVAL_LEVELS, FINER_LEVELS = 10, 41
-ANGLE_LEVELS, ANGLE_FINER, ANGLE_RANGE = 5, 11, np.geomspace(0.1, 10.0, 7)
+ANGLE_LEVELS, ANGLE_FINER, ANGLE_RANGE = 5, 11, np.geomspace(1e-4, 1e4, 17)
 COUNTS, FINER_COUNTS = (*[INTERVAL_LEVELS] * 4, ANGLE_LEVELS), (*[FINER_LEVELS] * 4, ANGLE_FINER)
 # A unit of so many times the largest amplitude makes a scale even in amplitude.
 LINEAR = 1e3

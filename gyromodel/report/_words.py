@@ -69,6 +69,8 @@ PHRASES = {
     "noise_telegraph": "hops of the bias between two levels (telegraph noise)",
     "noise_heteroscedastic": "a noise level that varies",
     "noise_markov_time": "time constant of the Markov noise",
+    "noise_telegraph_low": "mean time on the lower level",
+    "noise_telegraph_high": "mean time on the upper level",
 }
 
 
