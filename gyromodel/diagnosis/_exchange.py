@@ -10,7 +10,7 @@ import numpy as np
 from gyromodel.diagnosis._apart import like
 from gyromodel.diagnosis._forms import periodic
 from gyromodel.diagnosis._lines import lines_of, near
-from gyromodel.diagnosis._misfit import unsteady_lines
+from gyromodel.diagnosis._misfit import lines_of_noise, unsteady_lines
 from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, is_driver, is_noise
 from gyromodel.diagnosis._steps import EXCHANGE, Found, Steps, standing
 from gyromodel.effects.drivers import BiasPeriodic
@@ -124,7 +124,7 @@ def _chosen_again(
 
 
 def steady(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[list[Found], Estimate, str]:
-    """What was found less the lines that change, its fit, and what is to be said of these: none, if there are none.
+    """What was found less the lines that change or are noise of a band, its fit, and what is to be said of the first.
 
     Where these are the stronger, no line stands: the others are parts of the same.
     """
@@ -133,7 +133,8 @@ def steady(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[list[F
         lines, effect = lines_of(estimate.model), estimate.model.effects[estimate.model.labels.index("bias_periodic")]
         assert isinstance(effect, BiasPeriodic)
         own = np.array([not any(near(line, g, far) for g in given) for line in lines])
-        bad = own & np.array(unsteady_lines(estimate))
+        noise = np.array(lines_of_noise(estimate))
+        bad = own & (noise | np.array(unsteady_lines(estimate)))
         power = np.asarray(effect.cosine**2 + effect.sine**2)
         if power[bad].sum() > power[own & ~bad].sum():
             bad = own
@@ -145,12 +146,12 @@ def steady(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[list[F
         if after is None:
             break
         found, estimate = others, after
-        changing += [line.frequency for line, b in zip(lines, bad, strict=True) if b]
+        changing += [line.frequency for line, b in zip(lines, bad & ~noise, strict=True) if b]
     if not changing:
         return found, estimate, ""
     places = " and ".join(f"{frequency:.4g} Hz" for frequency in sorted(changing))
-    changes = "changes its size or its frequency, or is noise: it is no steady line, and is not named."
-    return found, estimate, f"What oscillates near {places} {changes}"
+    said = f"What oscillates near {places} changes its size or its frequency: it is no steady line, and is not named."
+    return found, estimate, said
 
 
 def uncontested(step: Found) -> bool:

@@ -80,10 +80,7 @@ def axis_probabilities(estimate: Estimate) -> dict[str, float]:
 
 
 def unsteady_lines(estimate: Estimate) -> list[bool]:
-    """Whether each line of a model has, or may have, another size or frequency at other times of its campaign.
-
-    So may one that is no larger than what a band of unexplained noise about it makes.
-    """
+    """Whether each line of a model has, or may have, another size or frequency at other times of its campaign."""
     model, record, lines = estimate.model, estimate.record, lines_of(estimate.model)
     if not lines:
         return []
@@ -103,22 +100,37 @@ def unsteady_lines(estimate: Estimate) -> list[bool]:
     columns = np.asarray(whiten_columns(filter_of(record, estimate.ratios), columns))[: record.rows][record.present]
     columns = columns / np.linalg.norm(columns, axis=0)
     taken = np.linalg.qr(columns[:, :p])[0]
-    residual, values, found = estimate.whitened[record.present], np.asarray(model.vector()), []
-    band = excess_band(estimate)
-    slots = list(enumerate(model.slots()))
+    residual, sizes_of, found = estimate.whitened[record.present], line_energies(estimate), []
     for k in range(len(lines)):
         wave = columns[:, p + 2 * BENDS * k :][:, : 2 * BENDS]
         left, sizes, _ = np.linalg.svd(wave - taken @ (taken.T @ wave), full_matrices=False)
         left = left[:, sizes > LEFT]
         changing = float(np.sum((left.T @ residual) ** 2))
-        own = [i for i, s in slots if s.linear and s.index == k and model.labels[s.effect] == "bias_periodic"]
-        steady = values[own] @ np.linalg.solve(estimate.covariance[np.ix_(own, own)], values[own])
         seldom = chi2.sf(changing, left.shape[1]) * len(lines) < SELDOM
         beside = any(near(lines[k], other, NEAR / record.span) for other in lines[:k] + lines[k + 1 :])
-        raised = band.ratio if band is not None and band.low <= lines[k].frequency <= band.high else 0.0
-        made = raised and chi2.sf(steady / raised, 2) * record.rows / 2 > SELDOM
-        found.append(beside or bool(made or (seldom and changing > UNSTEADY * (changing + steady))))
+        found.append(beside or bool(seldom and changing > UNSTEADY * (changing + sizes_of[k])))
     return found
+
+
+def lines_of_noise(estimate: Estimate) -> list[bool]:
+    """Whether each line of a model is no larger than what a band of unexplained noise about it makes."""
+    lines, band = lines_of(estimate.model), excess_band(estimate)
+    if not lines or band is None:
+        return [False] * len(lines)
+    chance = chi2.sf(line_energies(estimate) / band.ratio, 2) * estimate.record.rows / 2
+    within = [band.low <= line.frequency <= band.high for line in lines]
+    return [bool(there and c > SELDOM) for there, c in zip(within, chance, strict=True)]
+
+
+def line_energies(estimate: Estimate) -> np.ndarray:
+    """χ² of the cosine and sine of each line of a model."""
+    model = estimate.model
+    values, slots = np.asarray(model.vector()), list(enumerate(model.slots()))
+    found = []
+    for k in range(len(lines_of(model))):
+        own = [i for i, s in slots if s.linear and s.index == k and model.labels[s.effect] == "bias_periodic"]
+        found.append(values[own] @ np.linalg.solve(estimate.covariance[np.ix_(own, own)], values[own]))
+    return np.array(found)
 
 
 def excess_band(estimate: Estimate) -> Band | None:

@@ -149,9 +149,9 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
 
 
 def steadied(steps: Steps, selection: Selection) -> Selection:
-    """A selection less the lines that change, which are told of as what remains."""
+    """A selection less the lines that change, which are told of as what remains, or are noise of a band."""
     found, estimate, said = steady(steps, list(selection.found), selection.estimate)
-    if not said:
+    if estimate is selection.estimate:
         return selection
     ranking = steps.rank(estimate, found)
     return replace(
@@ -162,7 +162,7 @@ def steadied(steps: Steps, selection: Selection) -> Selection:
         estimates=(*selection.estimates[:-1], estimate),
         driver=significant_driver(ranking, steps.threshold),
         left_out={},
-        remains="bias_periodic",
+        remains="bias_periodic" if said else selection.remains,
         unresolved=said,
     )
 
