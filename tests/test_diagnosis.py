@@ -293,7 +293,7 @@ def test_evidence_of_many_sets_is_that_of_each(rng: np.random.Generator) -> None
     t = rng.chisquare(2, (300, 40))
     t[7, :3] += [20.0, 60.0, 120.0]
     each = [log_mean_evidence(t[:, [i]], np.full(1, 900.0), 900, 2)[0] for i in range(40)]
-    assert np.allclose(log_mean_evidence(t, np.full(40, 900.0), 900, 2), each, rtol=0, atol=1e-4)
+    assert np.allclose(log_mean_evidence(t, np.full(40, 900.0), 900, 2), each, rtol=0, atol=3e-3)
 
 
 def test_a_fold_does_not_search_what_only_the_rows_left_out_would_tell(rng: np.random.Generator) -> None:

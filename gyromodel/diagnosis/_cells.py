@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import groupby
 from typing import NamedTuple
 
@@ -68,6 +69,14 @@ class Pack(NamedTuple):
 
     rows: list[jax.Array]
     parts: list[tuple[int | None, int, int, int]]
+
+
+class Products(NamedTuple):
+    """V⁻¹x of a baseline's columns and residuals, and the inner products of the candidates' columns with each."""
+
+    z: np.ndarray
+    baseline: np.ndarray
+    residuals: np.ndarray
 
 
 class Cells:
@@ -161,22 +170,29 @@ class Cells:
             groups += [same[i : i + together] for i in range(0, len(same), together)]
         return groups
 
-    def inner_products(self, group: Sequence[int], data: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Per cell of a group, V⁻¹x of the data's columns and its inner products with the candidates' columns."""
+    def inner_products(self, group: Sequence[int], data: np.ndarray, exact: int) -> list[Products]:
+        """Per cell of a group, V⁻¹x of the data's columns and its inner products with the candidates' columns.
+
+        Of so many data that they are draws, all columns but the first `exact` have theirs in single precision.
+        """
         columns = data.shape[1]
         step = FEW_STEP if columns <= FEW_COLUMNS else COLUMN_STEP
         data = np.pad(data, ((0, 0), (0, -columns % step)))
         if columns > FEW_COLUMNS:
-            z = np.asarray(precision(self[group[0]].filter, data))[:, :columns, None]
-        else:
-            filters = [self[g].filter for g in (*group, *[group[0]] * (CELLS_TOGETHER - len(group)))]
-            gain, scale = (
-                np.stack([np.asarray(getattr(f, part)) for f in filters], axis=-1) for part in ("gain", "scale")
-            )
-            z = np.asarray(precision(filters[0]._replace(gain=gain, scale=scale), data))[:, :columns, : len(group)]
+            z = np.asarray(precision(self[group[0]].filter, data))[:, :columns]
+            drawn = np.ascontiguousarray(z[:, exact:], np.float32)
+            return [Products(z, self._columns.T @ z[:, :exact], self._single.T @ drawn)]
+        filters = [self[g].filter for g in (*group, *[group[0]] * (CELLS_TOGETHER - len(group)))]
+        gain, scale = (np.stack([np.asarray(getattr(f, part)) for f in filters], axis=-1) for part in ("gain", "scale"))
+        z = np.asarray(precision(filters[0]._replace(gain=gain, scale=scale), data))[:, :columns, : len(group)]
         z = np.ascontiguousarray(z.transpose(0, 2, 1))
-        cross = self._columns.T @ z.reshape(len(z), -1)
-        return z.transpose(1, 0, 2), cross.reshape(-1, len(group), columns).transpose(1, 0, 2)
+        cross = (self._columns.T @ z.reshape(len(z), -1)).reshape(-1, len(group), columns)
+        return [Products(z[:, i], cross[:, i, :exact], cross[:, i, exact:]) for i in range(len(group))]
+
+    @cached_property
+    def _single(self) -> np.ndarray:
+        """The candidates' columns in single precision."""
+        return self._columns.astype(np.float32)
 
 
 def _add_squares(total: np.ndarray, columns: np.ndarray) -> None:

@@ -100,8 +100,8 @@ class LineGrid:
         found = []
         for _, rows in self.runs_within(0, len(columns)):
             spread = np.stack([np.bincount(self.index[rows], column[rows], self.length) for column in columns.T])
-            found.append(np.asarray(scipy.fft.rfft(spread, axis=1))[:, here].T)
-        both = np.concatenate(found)
+            found.append(np.asarray(scipy.fft.rfft(spread.astype(columns.dtype, copy=False), axis=1))[:, here])
+        both = np.concatenate(found, axis=1).T
         return np.real(both), -np.imag(both)
 
     def barred(self, lines: Sequence[Line]) -> np.ndarray:

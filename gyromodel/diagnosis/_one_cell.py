@@ -10,11 +10,18 @@ from scipy.linalg import solve_triangular
 from scipy.special import gammaln
 
 from gyromodel.diagnosis._batch import Batch
-from gyromodel.diagnosis._evidence import log_evidence_ratio, log_mean_evidence, log_mean_of_parts
+from gyromodel.diagnosis._evidence import (
+    FEW_SETS,
+    evidence_of_draws,
+    log_evidence_ratio,
+    log_mean_evidence,
+    log_mean_of_parts,
+)
 from gyromodel.diagnosis._lines import PEAK_WIDTH, PEAKS
 from gyromodel.diagnosis._tangents import VANISHED
 
 if TYPE_CHECKING:
+    from gyromodel.diagnosis._cells import Products
     from gyromodel.diagnosis._scan import Scanner
 
 # Of what giving up points explains, the part of a sum that is rounding.
@@ -23,6 +30,8 @@ SINGULAR = 1e-10
 CLEARLY = 4.0
 # Lines whose interpolated statistic, were it this much larger, would not pay for the search are left interpolated.
 PEAK_SLACK = 1.5
+# Data sets whose lines are worked out at once: as many as stay in the processor's cache.
+SETS_TOGETHER = 16
 # Further gross errors that are given up with the greatest: evidence of each alone (nats), the search over rows paid
 # for, and rows to the next, as errors side by side share theirs.
 ERROR_MARGIN, ERROR_DISTANCE = 8.0, 3
@@ -34,29 +43,33 @@ class OneCell:
     Args:
         scanner: the search, and its cells.
         g: which cell.
-        x: the baseline's columns, then the residuals.
-        z: V⁻¹x.
-        cross: inner products of the candidates' columns with z.
+        x: the baseline's columns, then the residuals, after `first` others.
+        products: V⁻¹x, and its inner products with the candidates' columns; of many residuals in single precision.
+        first: how many columns are neither.
         p: how many columns are the baseline's.
     """
 
-    def __init__(self, scanner: Scanner, g: int, x: np.ndarray, z: np.ndarray, cross: np.ndarray, p: int) -> None:
+    def __init__(self, scanner: Scanner, g: int, x: np.ndarray, products: Products, first: int, p: int) -> None:
         self._scanner, self._g, self._cell = scanner, g, scanner.cells[g]
+        x, z = x[:, first:], products.z[:, first:]
         against = x[:, :p].T @ z
         norm = np.sqrt(np.maximum(np.diag(against)[:p], 1e-300))
         scaled = against[:, :p] / np.outer(norm, norm) + 1e-13 * np.eye(p)
         root = np.linalg.inv(np.linalg.cholesky(scaled)) / norm
         jy = root @ against[:, p:]
         self._nu = nu = scanner.degrees_of_freedom - p
-        rss = np.maximum(np.sum(x[:, p:] * z[:, p:], axis=0) - np.sum(jy**2, axis=0), max(nu * scanner.least, 1e-300))
+        rss = np.einsum("ij,ij->j", x[:, p:], z[:, p:]) - np.sum(jy**2, axis=0)
+        rss = np.maximum(rss, max(nu * scanner.least, 1e-300))
         log_j = 2.0 * np.log(norm).sum() + np.linalg.slogdet(scaled)[1]
         log_likelihood = -0.5 * self._cell.log_determinant - 0.5 * log_j - 0.5 * nu * np.log(rss)
         self.batch = Batch(log_likelihood, rss, {}, {}, {}, {})
         # V⁻¹ of the baseline's orthonormal columns and of what they leave; the candidates' inner products with both.
         self._zj = z[:, :p] @ root.T
-        self._zy = z[:, p:] - self._zj @ jy
-        self._cross_j = cross[:, :p] @ root.T
-        self._cross_y = cross[:, p:] - self._cross_j @ jy
+        self._cross_j = products.baseline[:, first:] @ root.T
+        kind = products.residuals.dtype
+        self._zy = np.asarray(z[:, p:] - self._zj @ jy, kind)
+        self._cross_y = products.residuals - self._cross_j.astype(kind) @ jy.astype(kind)
+        self._rss = rss.astype(kind)
 
     def blocks(self, least: np.ndarray, lost: np.ndarray) -> None:
         """Every block's evidence.
@@ -66,8 +79,8 @@ class OneCell:
             lost: blocks that the rows left out told of.
         """
         batch, nu, table, bank = self.batch, self._nu, self._scanner.table, self._scanner.bank
-        blocks, draws = len(bank.blocks), self._cross_y.shape[1]
-        t_of, q_of, energy = np.zeros((blocks, draws)), np.zeros(blocks), np.zeros(blocks)
+        blocks, draws, kind = len(bank.blocks), self._cross_y.shape[1], self._cross_y.dtype
+        t_of, q_of, energy = np.zeros((blocks, draws), kind), np.zeros(blocks), np.zeros(blocks)
         for q, (first, count, start) in bank.layout().items():
             own = self._cell.blocks[q]
             c = self._cross_j[start : start + q * count].reshape(count, q, -1)
@@ -76,13 +89,13 @@ class OneCell:
             a = (own - c @ c.transpose(0, 2, 1)) / (norm[:, :, None] * norm[:, None, :])
             values, vectors = np.linalg.eigh(a)
             keep = values > VANISHED
-            along = vectors.transpose(0, 2, 1) @ (b / norm[:, :, None])
-            t = np.sum(np.where(keep, 1.0 / np.where(keep, values, 1.0), 0.0)[:, :, None] * along**2, axis=1)
+            along = (vectors.transpose(0, 2, 1) / norm[:, None, :]).astype(kind) @ b
+            inverse = np.where(keep, 1.0 / np.where(keep, values, 1.0), 0.0).astype(kind)
+            t = np.sum(inverse[:, :, None] * along**2, axis=1)
             here = slice(first, first + count)
             out = b[:, 0] < (table.smallest[here] * a[:, 0, 0] * norm[:, 0] ** 2)[:, None]
             if q > 1 and table.positive[here].any():
                 # What would be clearly negative in one of its coefficients.
-                inverse = np.where(keep, 1.0 / np.where(keep, values, 1.0), 0.0)
                 sizes = vectors @ (inverse[:, :, None] * along)
                 spread = np.sqrt(np.einsum("bij,bj->bi", vectors**2, inverse))
                 noise = np.sqrt(np.maximum(batch.rss - t, 1e-300) / nu)
@@ -93,19 +106,37 @@ class OneCell:
         # A form that loses more columns than the baseline contains is another form in disguise.
         sound = (q_of >= least) & ~lost
         energy[~sound] = 0.0
+        energies = np.split(energy[table.order], table.structure_starts[table.name_starts][1:])
+        batch.energy |= dict(zip(table.names, energies, strict=True))
+        if draws > FEW_SETS:
+            self._names_of_draws(t_of, q_of, sound)
+            return
         batch.explained = np.where(sound[:, None], t_of, 0.0)
-        ratio = log_evidence_ratio(t_of, batch.rss, nu, q_of[:, None]) - table.price[:, None]
+        ratio = log_evidence_ratio(t_of, self._rss, nu, q_of[:, None]) - table.price[:, None].astype(kind)
         ratio = np.where(sound[:, None], ratio, -np.inf)[table.order]
         # Structures compete by their mean over shapes; the best shape of the best structure stands for the name.
         means, shapes = log_mean_of_parts(ratio, table.structure_starts)
         evidence, best = log_mean_of_parts(means, table.name_starts)
         forms = table.order[np.take_along_axis(shapes, best, axis=0)]
-        energies = np.split(energy[table.order], table.structure_starts[table.name_starts][1:])
-        for name, value, form, own in zip(table.names, evidence, forms, energies, strict=True):
-            batch.energy[name] = own
+        for name, value, form in zip(table.names, evidence, forms, strict=True):
             if np.isfinite(value[0]):
                 batch.evidence[name] = value
                 batch.best[name] = (list(form), t_of[form, np.arange(draws)], q_of[form])
+
+    def _names_of_draws(self, t_of: np.ndarray, q_of: np.ndarray, sound: np.ndarray) -> None:
+        """Evidence of names of many data sets, as `log_mean_of_parts` twice: none asks which form is best."""
+        table, b = self._scanner.table, np.zeros(t_of.shape)
+        for q in np.unique(q_of[sound]):
+            here = np.flatnonzero(sound & (q_of == q))
+            b[here] = evidence_of_draws(t_of[here], self._rss, self._nu, int(q)) * np.exp(-table.price[here])[:, None]
+        count = sound[table.order].astype(int)
+        b = b[table.order]
+        for starts in (table.structure_starts, table.name_starts):
+            of_part = np.add.reduceat(count, starts)
+            b = np.add.reduceat(b, starts, axis=0) / np.maximum(of_part, 1)[:, None]
+            count = (of_part > 0).astype(int)
+        named = [(name, value) for name, value, there in zip(table.names, b, count, strict=True) if there]
+        self.batch.evidence |= {name: np.log(value) for name, value in named}
 
     def steps(self) -> None:
         """A step before each epoch."""
@@ -132,13 +163,13 @@ class OneCell:
         left, y = (w.T @ w - cross @ cross.T) / np.outer(length, length), marks.T @ self._zy / length[:, None]
         evidence, explained, dimension = np.full(len(orders), -np.inf), np.zeros(len(orders)), np.zeros(len(orders))
         best: list[tuple[int, ...]] = [()] * len(orders)
+        every = np.arange(1, min(len(among), nu - 1) + 1)
+        sets = gammaln(len(points) + 1) - gammaln(every + 1) - gammaln(len(points) - every + 1)
         for i, (order, rss) in enumerate(zip(orders, batch.rss, strict=True)):
-            sizes = np.arange(1, min(len(order), nu - 1) + 1)
+            sizes = every[: len(order)]
             if not len(sizes):
                 continue
-            price = (
-                gammaln(len(points) + 1) - gammaln(sizes + 1) - gammaln(len(points) - sizes + 1) + np.log(len(sizes))
-            )
+            price = sets[: len(sizes)] + np.log(len(sizes))
             chosen = np.searchsorted(among, order[: len(sizes)])
             # What the first, the first two … explain.
             root = np.linalg.cholesky(left[np.ix_(chosen, chosen)] + SINGULAR * np.eye(len(chosen)))
@@ -163,20 +194,28 @@ class OneCell:
     def lines(self, barred: np.ndarray) -> None:
         """A line at each frequency but the barred."""
         assert self._scanner.lines is not None
-        batch, own, p = self.batch, self._cell.line, self._zj.shape[1]
-        c, s = self._scanner.lines.spectrum(np.column_stack([self._zj, self._zy]))
-        a11 = own[:, 0, 0] - np.sum(c[:, :p] ** 2, axis=1)
-        a22 = own[:, 1, 1] - np.sum(s[:, :p] ** 2, axis=1)
-        a12 = own[:, 0, 1] - np.sum(c[:, :p] * s[:, :p], axis=1)
+        own, spectrum, kind = self._cell.line, self._scanner.lines.spectrum, self._zy.dtype
+        cj, sj = spectrum(self._zj)
+        a11 = own[:, 0, 0] - np.sum(cj**2, axis=1)
+        a22 = own[:, 1, 1] - np.sum(sj**2, axis=1)
+        a12 = own[:, 0, 1] - np.sum(cj * sj, axis=1)
         determinant = a11 * a22 - a12**2
         keep = (determinant > 1e-3 * own[:, 0, 0] * own[:, 1, 1]) & (a11 > 0) & ~barred
-        weight = np.where(keep, 1.0 / np.where(keep, determinant, 1.0), 0.0)[:, None]
-        bc, bs = c[:, p:], s[:, p:]
-        t = weight * (a22[:, None] * bc**2 - 2 * a12[:, None] * bc * bs + a11[:, None] * bs**2)
-        worth = log_evidence_ratio(PEAK_SLACK * t.max(axis=0), batch.rss, self._nu, 2) > np.log(len(t))
-        if len(worth) == 1 and worth[0]:
-            batch.peaks = self._exact_peaks(t[:, 0], c, s)
-        self._record("bias_periodic", np.arange(len(t)), t, np.where(keep, a11, 0.0), 2)
+        # A line explains (along (c − lean s))² + (across s)².
+        a22, determinant = np.where(keep, a22, 1.0), np.where(keep, determinant, 1.0)
+        along, lean, across = (
+            np.where(keep, x, 0.0).astype(kind) for x in (np.sqrt(a22 / determinant), a12 / a22, a22**-0.5)
+        )
+        t = np.zeros((self._zy.shape[1], len(keep)), kind)
+        c = s = t.T
+        for i in range(0, len(t), SETS_TOGETHER):
+            c, s = spectrum(self._zy[:, i : i + SETS_TOGETHER])
+            t[i : i + SETS_TOGETHER] = (along * (c.T - lean * s.T)) ** 2 + (across * s.T) ** 2
+        if len(t) == 1:
+            worth = log_evidence_ratio(PEAK_SLACK * t.max(), self._rss[0], self._nu, 2) > np.log(len(keep))
+            if worth:
+                self.batch.peaks = self._exact_peaks(t[0], np.column_stack([cj, c]), np.column_stack([sj, s]))
+        self._record("bias_periodic", np.arange(len(keep)), t.T, np.where(keep, a11, 0.0), 2)
 
     def _exact_peaks(self, t: np.ndarray, c: np.ndarray, s: np.ndarray) -> dict[int, float]:
         """Correct the statistic around the leading peaks, in place, by their exact energy; what each explains."""
@@ -208,7 +247,7 @@ class OneCell:
         """Record one column anywhere; what it explains."""
         left = own - np.sum(cross**2, axis=1)
         keep = left > VANISHED * own
-        t = np.where(keep, 1.0 / np.where(keep, left, 1.0), 0.0)[:, None] * b**2
+        t = np.where(keep, 1.0 / np.where(keep, left, 1.0), 0.0).astype(b.dtype)[:, None] * b**2
         self._record(name, where, t, np.where(keep, left, 0.0), 1)
         return t
 
@@ -217,9 +256,9 @@ class OneCell:
         if not len(where):
             return
         batch = self.batch
-        top = np.argmax(np.minimum(t, batch.rss), axis=0)
-        best = np.minimum(t[top, np.arange(len(top))], batch.rss)
-        batch.evidence[name] = log_mean_evidence(t, batch.rss, self._nu, q)
+        top = np.argmax(np.minimum(t, self._rss), axis=0)
+        best = np.minimum(t[top, np.arange(len(top))], self._rss)
+        batch.evidence[name] = log_mean_evidence(t, self._rss, self._nu, q)
         batch.best[name] = (list(where[top]), best, np.full(len(top), float(q)))
         batch.energy[name] = energy
 

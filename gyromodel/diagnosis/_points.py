@@ -24,7 +24,7 @@ FEWEST_SAMPLES, FEWEST_DWELLS, MOST_APART = 4, 12, 0.2
 APART, SUSPECT = 8.0, 4.0
 DWELLS_TOLD = 6
 # Fits through as few points as determine them: of so many, one is through good points only.
-FITS, SOUND = 1000, 1e-6
+FITS, FIRST_FITS, SOUND = 1000, 50, 1e-6
 
 
 def test_points(record: Record) -> list[np.ndarray]:
@@ -154,7 +154,10 @@ def robust_orders(columns: np.ndarray, data: np.ndarray) -> Iterator[tuple[np.nd
     through = through[sound >= SOUND * sound.max()]
     solved, half = np.linalg.inv(u[through]), p + (n - p) // 2
     for y in data.T:
-        misfit = np.abs(y - (solved @ y[through][..., None])[..., 0] @ u.T)
-        median = np.partition(misfit, half, axis=1)[:, half]
-        best = int(np.argmin(median))
-        yield np.argsort(-misfit[best]), float(misfit[best].max() / max(1.4826 * median[best], 1e-300))
+        misfit = np.abs(y - np.einsum("kij,kj->ki", solved, y[through]) @ u.T)
+        # Medians are sought where they may be the least: where more than half lie within the least of a few.
+        least = np.partition(misfit[:FIRST_FITS], half, axis=1)[:, half].min()
+        able = np.flatnonzero(np.count_nonzero(misfit <= least, axis=1) > half)
+        median = np.partition(misfit[able], half, axis=1)[:, half]
+        best = misfit[able[np.argmin(median)]]
+        yield np.argsort(-best), float(best.max() / max(1.4826 * median.min(), 1e-300))

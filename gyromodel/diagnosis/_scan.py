@@ -176,10 +176,9 @@ class Scanner:
         )
 
         def search(group: Sequence[int]) -> list[Batch]:
-            z, cross = self.cells.inner_products(group, stacked)
             batches = []
-            for i, g in enumerate(group):
-                one = OneCell(self, g, stacked[:, first:], z[i][:, first:], cross[i][:, first:], p)
+            for g, products in zip(group, self.cells.inner_products(group, stacked, first + p), strict=True):
+                one = OneCell(self, g, stacked, products, first, p)
                 one.blocks(least, self._lost)
                 if self.steps:
                     one.steps()
@@ -189,7 +188,7 @@ class Scanner:
                     one.anomalous_points(points, orders)
                 if self.lines:
                     one.lines(barred)
-                add_tangents(one.batch, tangents, stacked, z[i], p, self.degrees_of_freedom - p)
+                add_tangents(one.batch, tangents, stacked, products.z, p, self.degrees_of_freedom - p)
                 batches.append(one.batch)
             return batches
 
