@@ -38,6 +38,11 @@ class Batch:
     peaks: dict[int, float]
     explained: np.ndarray = field(default_factory=lambda: np.zeros((0, 1)), repr=False)
 
+    def of(self, which: np.ndarray) -> Batch:
+        """What is said of some of many residuals, without the forms."""
+        evidence = {name: values[which] for name, values in self.evidence.items()}
+        return Batch(self.log_likelihood[which], self.rss[which], evidence, {}, self.energy, {})
+
     def first(self) -> CellResult:
         """The first residual's results as plain numbers."""
         best = {

@@ -31,6 +31,8 @@ from gyromodel.numerics.state_space import colour
 LEAST_TOGETHER, MOST_TOGETHER, VALUES_TOGETHER = 64, 256, 2**18
 # Draws are searched in the noise cells that hold this part of the weight of the first few.
 HELD, FIRST = 0.995, 32
+# All draws are searched in every other cell of so many or more, and this part of them, the largest there, in all.
+FEWEST_CELLS, LARGEST = 8, 0.25
 # Columns that a test sets; others (a supply voltage, a pressure) wander, in each campaign of a design otherwise.
 SET = ("rate", "temperature", "acceleration", "azimuth", "table", "magnetic", "vibration", "feedback", "campaign")
 # Parts of a record whose means are a column's course, and how far courses (in their own spread), lengths, intervals (as
@@ -38,7 +40,7 @@ SET = ("rate", "temperature", "acceleration", "azimuth", "table", "magnetic", "v
 COURSE, SAME = 32, 0.1
 
 # Counts the rules by which draws have been scored: those kept by an earlier one do not serve.
-RULE = 9
+RULE = 10
 
 _draw = jax.jit(jax.vmap(colour, in_axes=(None, 0)))
 
@@ -76,10 +78,18 @@ def null_scores(
     together = min(
         max(VALUES_TOGETHER // rows, LEAST_TOGETHER), MOST_TOGETHER, -(-draws // LEAST_TOGETHER) * LEAST_TOGETHER
     )
-    scores = []
+    first = scanner.checked(cells) if len(cells) >= FEWEST_CELLS else cells
+    rest, scores = [g for g in cells if g not in first], []
     for start in range(0, draws, together):
-        batches = scanner.run_many(cells, columns, draw(together), {}, tangents=continued)
-        scores.append(_significance(scanner, cells, batches, skip))
+        drawn = draw(together)
+        batches = scanner.run_many(first, columns, drawn, {}, tangents=continued)
+        found = _significance(scanner, first, batches, skip)
+        if rest:
+            large = np.argsort(-found)[: round(together * LARGEST)]
+            both = [b.of(large) for b in batches]
+            both += scanner.run_many(rest, columns, drawn[:, large], {}, tangents=continued)
+            found[large] = _significance(scanner, [*first, *rest], both, skip)
+        scores.append(found)
         say("calibrating the threshold", 0.06 + 0.18 * min(1.0, (start + together) / draws))
     found = np.concatenate(scores)[:draws]
     with suppress(OSError):

@@ -212,8 +212,8 @@ class OneCell:
             c, s = spectrum(self._zy[:, i : i + SETS_TOGETHER])
             t[i : i + SETS_TOGETHER] = (along * (c.T - lean * s.T)) ** 2 + (across * s.T) ** 2
         if len(t) == 1:
-            worth = log_evidence_ratio(PEAK_SLACK * t.max(), self._rss[0], self._nu, 2) > np.log(len(keep))
-            if worth:
+            worth = log_evidence_ratio(PEAK_SLACK * t.max(axis=1), self._rss, self._nu, 2) > np.log(len(keep))
+            if worth[0]:
                 self.batch.peaks = self._exact_peaks(t[0], np.column_stack([cj, c]), np.column_stack([sj, s]))
         self._record("bias_periodic", np.arange(len(keep)), t.T, np.where(keep, a11, 0.0), 2)
 

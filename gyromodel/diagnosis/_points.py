@@ -153,11 +153,15 @@ def robust_orders(columns: np.ndarray, data: np.ndarray) -> Iterator[tuple[np.nd
     sound = np.abs(np.linalg.det(u[through]))
     through = through[sound >= SOUND * sound.max()]
     solved, half = np.linalg.inv(u[through]), p + (n - p) // 2
-    for y in data.T:
-        misfit = np.abs(y - np.einsum("kij,kj->ki", solved, y[through]) @ u.T)
+    # An order needs no more than single precision.
+    solved, u = solved.astype(np.float32), u.astype(np.float32)
+    misfit = np.zeros((len(through), n), np.float32)
+    for y in data.T.astype(np.float32):
+        np.matmul(np.einsum("kij,kj->ki", solved, y[through]), u.T, out=misfit)
+        np.abs(np.subtract(misfit, y, out=misfit), out=misfit)
         # Medians are sought where they may be the least: where more than half lie within the least of a few.
         least = np.partition(misfit[:FIRST_FITS], half, axis=1)[:, half].min()
         able = np.flatnonzero(np.count_nonzero(misfit <= least, axis=1) > half)
         median = np.partition(misfit[able], half, axis=1)[:, half]
         best = misfit[able[np.argmin(median)]]
-        yield np.argsort(-best), float(best.max() / max(1.4826 * median.min(), 1e-300))
+        yield np.argsort(-best), float(best.max() / max(1.4826 * float(median.min()), 1e-300))

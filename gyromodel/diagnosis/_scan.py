@@ -117,6 +117,11 @@ class Scanner:
         flicker, walk = self._levels()
         return [g for g in self.all_cells() if flicker[g] % 2 == 0 and walk[g] % 2 == 0]
 
+    def checked(self, cells: Sequence[int]) -> list[int]:
+        """Every other of some cells, as on a board of chess."""
+        flicker, walk = self._levels()
+        return [g for g in cells if (flicker[g] + walk[g]) % 2 == 0]
+
     def neighbours(self, cells: set[int]) -> list[int]:
         """These cells and those one level away."""
         flicker, walk = self._levels()
