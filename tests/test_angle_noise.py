@@ -46,6 +46,7 @@ def stated(*effects: str, white: float = N, angle: float = Q) -> gm.GyroModel:
     return replace(gm.model_from_effects(list(effects)), noise={"noise_white": white, "noise_quantisation": angle})
 
 
+@pytest.mark.long
 @pytest.mark.law
 def test_both_kinds_have_their_size_and_fits_the_uncertainty_that_they_leave(rng: np.random.Generator):
     """Taken for white noise of the rate, the counts would make the bias eight times as uncertain."""
@@ -98,6 +99,7 @@ def test_it_is_no_noise_of_a_platform(tmp_path: Path):
         gm.read_model(path)
 
 
+@pytest.mark.long
 @pytest.mark.law
 def test_an_effect_below_what_counts_as_white_noise_is_named(rng: np.random.Generator):
     """A temperature coefficient that would be lost at a third of its uncertainty were the counts white noise."""

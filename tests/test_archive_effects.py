@@ -61,7 +61,7 @@ def test_shares_and_units_are_told_as_often_as_they_are_so(seed: int):
 
 
 @pytest.mark.law
-@pytest.mark.parametrize("units", [2, 8, 60])
+@pytest.mark.parametrize("units", [2, *(pytest.param(units, marks=pytest.mark.long) for units in (8, 60))])
 def test_archives_with_nothing_in_them_show_nothing(units: int, seed: int):
     """ln B exceeds 4 in less than exp(−4) of archives, whatever their size: its mean is one."""
     rng, count = np.random.default_rng(seed), 300

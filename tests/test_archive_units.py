@@ -44,7 +44,9 @@ def statistics(table: pa.Table) -> Parameter:
     return found
 
 
-@pytest.mark.parametrize(("units", "campaigns"), [(12, 1), (6, 4), (20, 3)])
+@pytest.mark.parametrize(
+    ("units", "campaigns"), [(12, 1), *(pytest.param(*case, marks=pytest.mark.long) for case in ((6, 4), (20, 3)))]
+)
 def test_intervals_cover_whatever_the_spreads_are(units: int, campaigns: int, seed: int):
     """One campaign of each archive, as those of one archive err together; a uniform prior errs on the wide side."""
     rng = np.random.default_rng(seed)
@@ -78,6 +80,7 @@ def test_short_campaigns_gain_most_where_units_are_alike(seed: int):
     assert pooled < 0.5 * raw
 
 
+@pytest.mark.long
 def test_nothing_stands_out_but_by_chance(seed: int):
     rng, archives = np.random.default_rng(seed), 120
     alarms = np.zeros(2, int)

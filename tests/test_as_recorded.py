@@ -111,6 +111,7 @@ def test_derivatives_of_lines_in_means_are_those_of_differences():
     assert np.abs(near - far).max() < 0.05 * np.abs(far).max()
 
 
+@pytest.mark.long
 def test_gross_errors_given_up_shape_no_unknown_function(rng: np.random.Generator):
     temperature = 20.0 + 15.0 * np.sin(np.linspace(0.0, 12.0, 400))
     output = 10.0 * np.sin(2 * np.pi * temperature / 11.0) + rng.standard_normal(400)
@@ -176,6 +177,7 @@ def test_an_interval_after_selection_starts_from_what_was_stated(size: float, to
     assert _told(delay, lag, 0.97, True, None).ci95 is not None
 
 
+@pytest.mark.long
 def test_a_scale_factor_error_is_told_in_ppm(rng: np.random.Generator):
     rate = rng.uniform(-50.0, 50.0, 60)
     measured = campaign(rate * 1.001 + 0.002 * rng.standard_normal(60), unit="deg/s", rate=rate)
@@ -186,7 +188,10 @@ def test_a_scale_factor_error_is_told_in_ppm(rng: np.random.Generator):
 
 
 @pytest.mark.parametrize("walk", [0.0, 5e-4])
-@pytest.mark.parametrize(("counted", "late"), [(True, 0.0), (False, 0.0), (False, 0.012)])
+@pytest.mark.parametrize(
+    ("counted", "late"),
+    [pytest.param(True, 0.0, marks=pytest.mark.long), (False, 0.0), pytest.param(False, 0.012, marks=pytest.mark.long)],
+)
 def test_increments_over_intervals_are_not_late(counted: bool, late: float, walk: float, rng: np.random.Generator):
     """Beside rates at the rows, whose product with the interval other increments are: a delay is none of half of it."""
     time = 0.01 * np.arange(1500)

@@ -182,6 +182,7 @@ def test_explained_for_inverts_the_evidence() -> None:
     assert float(log_evidence_ratio(np.array(t), 900.0, 900, 1)) == pytest.approx(5.0, abs=1e-6)
 
 
+@pytest.mark.long
 def test_units_of_the_output_change_nothing(seed: int) -> None:
     ramp = 8.0 * np.sin(2 * np.pi * 20.0 * np.arange(ROWS) / 4000.0)
     found = []
@@ -558,16 +559,22 @@ def test_a_name_is_the_same_only_as_what_holds_its_signal(case: study.Case) -> N
 # polynomial make up a whole one.
 PAIRS = [
     study.Case(1825966395333899, "rate_temperature", "white", "bias+rate_hysteresis", 3.0),
+    study.Case(2041148088517304, "rate_steps", "white", "scale_nonlinearity+rate_hysteresis", 3.0),
+]
+FURTHER_PAIRS = [
     study.Case(1527133870609146, "rate_temperature", "white", "scale_nonlinearity+bias", 3.0),
     # A bend that is a cubic until the voltage is known, a loop whose width the noise beside it pulls away, and a
     # polynomial that a spline tells as well.
     study.Case(956050892807993, "rate_temperature", "random_walk", "bias_temperature_curve+bias_supply_voltage", 3.0),
     study.Case(1097988085697281, "static_cycle", "random_walk", "bias_temperature_rate+bias_thermal_hysteresis", 3.0),
-    study.Case(2041148088517304, "rate_steps", "white", "scale_nonlinearity+rate_hysteresis", 3.0),
 ]
 
 
-@pytest.mark.parametrize("case", PAIRS, ids=lambda case: case.effect)
+@pytest.mark.parametrize(
+    "case",
+    [*PAIRS, *(pytest.param(case, marks=pytest.mark.long) for case in FURTHER_PAIRS)],
+    ids=lambda case: case.effect,
+)
 def test_two_causes_are_named_exactly(case: study.Case) -> None:
     answer = study.run_engine(study.build(case))
     assert answer.verdict == "named"
@@ -581,12 +588,14 @@ ALONE = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", ALONE, ids=lambda case: case.effect)
 def test_a_further_cause_needs_more_than_the_first(case: study.Case) -> None:
     answer = study.run_engine(study.build(case))
     assert (answer.verdict, answer.causes) == ("named", (case.effect,))
 
 
+@pytest.mark.long
 def test_what_follows_a_column_ahead_of_all_further_names_is_unknown() -> None:
     """A ripple over temperature that a loop leads, after which a name of 4 nats is tried ahead of a driver of 14."""
     answer = study.run_engine(
@@ -595,6 +604,7 @@ def test_what_follows_a_column_ahead_of_all_further_names_is_unknown() -> None:
     assert (answer.verdict, answer.driver) == ("unknown", ("temperature",))
 
 
+@pytest.mark.long
 def test_two_names_stay_where_neither_holds_the_other() -> None:
     """A bias of 16 and a temperature-rate bias of 5 standard deviations, which share nothing."""
     rows, rng = 2000, np.random.default_rng(3)
@@ -628,6 +638,7 @@ def test_runs_of_three_rows_say_that_a_step_is_not_testable(campaigns: int) -> N
     assert "bias_step" in gm.isolability(each[0], stated, tests=False).not_testable
 
 
+@pytest.mark.long
 def test_what_a_fit_does_not_hold_is_not_found() -> None:
     """A saturation of another share than a whole one leads, and its fit gains nothing."""
     answer = study.run_engine(
@@ -637,6 +648,7 @@ def test_what_a_fit_does_not_hold_is_not_found() -> None:
     assert answer.causes[0] == "scale_nonlinearity"
 
 
+@pytest.mark.long
 def test_higher_harmonics_of_a_code_are_no_lines(rng: np.random.Generator, tmp_path) -> None:
     """The error of a bit has harmonics far beyond the series searched; at a constant rate each is a line."""
     time = 0.1 * np.arange(3000)
@@ -698,6 +710,7 @@ def test_no_campaign_is_said() -> None:
             answer([], gm.model_from_effects(["bias"]))
 
 
+@pytest.mark.long
 def test_a_bias_is_no_step_at_the_end_of_the_record() -> None:
     rng = np.random.default_rng(0)
     rate = rng.permutation(np.repeat(np.linspace(-50, 50, 30), 20))

@@ -82,6 +82,7 @@ def test_white_noise_gives_one_coefficient_three_ways(rng: np.random.Generator):
     assert abs(found["B0"].published - 7.0) < 5 * found["B0"].published_std
 
 
+@pytest.mark.long
 def test_uncertainties_hold_under_a_random_walk(rng: np.random.Generator):
     """2.5 standard uncertainties are about 95 % with noise estimated from each run; s/√n is fifteen times too small."""
     figures = figures_of_merit([run(white(rng) + walk(rng, 0.15)) for _ in range(30)]).figures

@@ -102,7 +102,7 @@ def test_a_doubtful_cause_does_not_hide_a_firm_one(rng: np.random.Generator) -> 
         assert label == "bias" or label in [c.effect for c in found.causes] or any(label in f for f in found.findings)
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("sign", [pytest.param(1.0, marks=pytest.mark.long), -1.0])
 def test_a_reversed_output_is_told_of(sign: float, rng: np.random.Generator):
     rate = rng.uniform(-10.0, 10.0, ROWS)
     measured = campaign(sign * rate + 0.01 * rng.normal(size=ROWS), unit="deg/s", rate=rate)
@@ -168,7 +168,7 @@ def test_soaks_at_one_temperature_each_are_no_runs(rng: np.random.Generator) -> 
     assert "run" not in read([many]).record.signals
 
 
-@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize("told", [pytest.param(True, marks=pytest.mark.long), False])
 def test_of_a_gyro_that_is_turned_over_the_earths_rate_is_told_of(told: bool, rng: np.random.Generator) -> None:
     """Six positions, 10 deg/h of the Earth's vertical rate in the output: the reference has it, or there is none."""
     up = np.repeat([1.0, 0.0, -1.0, 0.0, 1.0, -1.0], ROWS // 6)
@@ -183,6 +183,7 @@ def test_of_a_gyro_that_is_turned_over_the_earths_rate_is_told_of(told: bool, rn
     assert any("No reference rate is given" in line for line in found.findings) == (not told)
 
 
+@pytest.mark.long
 def test_lines_have_a_phase_of_their_own_in_each_campaign(rng: np.random.Generator) -> None:
     frequency, phases = 12.37 / TIME[-1], rng.uniform(0, 2 * np.pi, 3)  # off the grid of frequencies
     runs = [campaign(np.sin(2 * np.pi * frequency * TIME + phase) + rng.normal(size=ROWS)) for phase in phases]
@@ -278,7 +279,7 @@ def test_a_derived_signals_name_is_refused() -> None:
         campaign(np.arange(ROWS, dtype=float), time_on=TIME)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [pytest.param(k, marks=pytest.mark.long) if k in (0, 3) else k for k in range(6)])
 def test_nothing_is_left_out_silently(seed: int, rng: np.random.Generator) -> None:
     """Random mixtures: causes are significant, additions accounted for, columns searched or said not to be."""
     a, b, c = rng.normal(size=(3, ROWS))
@@ -345,7 +346,7 @@ def rate_table(rng: np.random.Generator, bad: int, shift: float, visits: int, wa
     return campaign(rate + error / 3600, np.arange(len(rate)) * 1.0, unit="deg/s", rate=rate)
 
 
-@pytest.mark.parametrize(("bad", "shift"), [(2, 6.0), (2, 60.0), (4, 20.0)])
+@pytest.mark.parametrize(("bad", "shift"), [(2, 6.0), (2, 60.0), pytest.param(4, 20.0, marks=pytest.mark.long)])
 def test_anomalous_dwells_measured_once_are_points_or_a_curve(bad: int, shift: float) -> None:
     drawn = rate_table(np.random.default_rng(bad), bad, shift, visits=1)
     found = gm.diagnose(drawn, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)

@@ -110,6 +110,7 @@ def test_the_next_test_settles_what_was_ambiguous(seed: int, effect: str):
     assert {"bias_temperature", "bias_drift"} & set(settled) == {effect}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("hidden", ["bias_temperature", "bias_drift"])
 def test_a_change_that_a_walk_could_make_is_told_under_any_name(hidden: str):
     """On one ramp temperature and time are one, and a random walk rises as they do: an example with a fixed seed."""

@@ -89,7 +89,9 @@ def campaign_of(design: Design, output: np.ndarray, unit: str = "deg/h") -> gm.C
     return gm.Campaign(design.columns | {"output": output}, design.units | {"output": unit}, dict(design.metadata))
 
 
-@pytest.mark.parametrize("effect", ["bias_temperature_rate", "bias_thermal_hysteresis"])
+@pytest.mark.parametrize(
+    "effect", ["bias_temperature_rate", pytest.param("bias_thermal_hysteresis", marks=pytest.mark.long)]
+)
 def test_one_ramp_speed_gives_no_firm_wrong_name(effect: str):
     score = study.run_case(study.Case(EXAMPLE, "one_speed_cycle", "white", effect, 3.0)).score
     assert score is not None
@@ -106,6 +108,7 @@ def lagging(rng: np.random.Generator, kind: str) -> tuple[gm.Campaign, float]:
     return campaign_of(design, wrong + rng.standard_normal(len(coil))), tau
 
 
+@pytest.mark.long
 def test_a_late_thermometer_under_a_curved_bias_is_named_with_its_delay():
     campaign, tau = lagging(np.random.default_rng(EXAMPLE), "parabola")
     found = gm.diagnose(campaign, gm.model_from_effects(["bias", "bias_temperature_curve"]), hold_out=False)
@@ -127,7 +130,7 @@ def with_late_coil(rng: np.random.Generator, tau: float, curved: bool) -> gm.Cam
     return campaign_of(design, (coil**2 / 20 if curved else coil) + rng.standard_normal(len(coil)))
 
 
-@pytest.mark.parametrize("curved", [True, False])
+@pytest.mark.parametrize("curved", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_a_coil_far_behind_the_thermometer_is_named_with_its_delay(curved: bool):
     """Its delay is no small part of the cycle, so that b(T) + b'(T) τ dT/dt is not what it makes."""
     rng = np.random.default_rng(EXAMPLE)
@@ -162,6 +165,7 @@ def test_a_late_coil_is_written_and_read(tmp_path):
         read_model(tmp_path / "other.yaml")
 
 
+@pytest.mark.long
 def test_a_late_thermometer_under_a_straight_bias_is_the_shupe_effect():
     campaign, _ = lagging(np.random.default_rng(EXAMPLE), "line")
     found = gm.diagnose(campaign, gm.model_from_effects(["bias", "bias_temperature"]), hold_out=False)
@@ -169,6 +173,7 @@ def test_a_late_thermometer_under_a_straight_bias_is_the_shupe_effect():
     assert set(found.credible_set) == {"bias_temperature_rate", "temperature_lag"}
 
 
+@pytest.mark.long
 def test_a_lag_beyond_reach_is_not_put_beside_the_shupe_effect():
     """A Shupe effect beside a bias so flat over temperature that the thermometer would have to be an hour late."""
     rng = np.random.default_rng(EXAMPLE)
@@ -269,6 +274,7 @@ def test_compensate_refuses_a_memory_of_rates():
         compensate(campaign, Calibration(GyroModel((make_effect("bias"), make_effect("rate_hysteresis")))))
 
 
+@pytest.mark.long
 def test_a_clipped_output_is_saturation():
     """Rates of a table beyond the range of the converter, which simply ends."""
     rng = np.random.default_rng(EXAMPLE)

@@ -102,6 +102,7 @@ def test_the_sign_of_output_and_rate_changes_nothing(first: Diagnosis):
     assert_alike(diagnosed(turned), first)
 
 
+@pytest.mark.long
 def test_the_order_of_runs_changes_nothing():
     half = np.arange(ROWS) < ROWS // 2
     one, two = campaign(SIZE, 4).select(half), campaign(SIZE, 5).select(half)

@@ -58,6 +58,7 @@ def test_steady_lines_are_named_and_no_band_is_told_of(rng: np.random.Generator)
     assert not any("oscillates" in line for line in found.findings)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("walk", [0.0, 0.1])
 def test_a_steady_line_is_never_said_to_change(walk: float, rng: np.random.Generator) -> None:
     """Lines in noise of its own each; one in ten thousand may be flagged."""

@@ -44,6 +44,7 @@ def test_backscatter_slows_a_turning_ring_laser_in_proportion_to_its_monitor(rng
     assert size.value == pytest.approx(-(lock_in**2) / (2 * rate) / DEG_H / 0.2, abs=5 * size.std)
 
 
+@pytest.mark.long
 def test_unequal_beams_shift_the_null_in_proportion_to_their_difference(rng: np.random.Generator):
     shifted, monitor = unequal_beams(0.02 * (wandering(ROWS, rng) - 0.5), 1.3, 50 * DEG_H)
     found = diagnosed(log(shifted, rng, null_shift=(monitor + 1e-4 * rng.standard_normal(ROWS), "")))
@@ -70,8 +71,8 @@ def commanded(rng: np.random.Generator) -> np.ndarray:
     ("constants", "terms"),
     [
         ((2e-3, 0.0, 0.0), {"scale"}),
-        ((0.0, 4e-3, 0.0), {"asymmetry"}),
-        ((0.0, 4e-3, 3e-4), {"scale", "asymmetry", "temperature"}),
+        pytest.param((0.0, 4e-3, 0.0), {"asymmetry"}, marks=pytest.mark.long),
+        pytest.param((0.0, 4e-3, 3e-4), {"scale", "asymmetry", "temperature"}, marks=pytest.mark.long),
     ],
 )
 def test_a_torquer_that_errs_is_named(constants: tuple[float, float, float], terms: set[str], rng: np.random.Generator):
@@ -91,6 +92,7 @@ def test_a_torquer_that_errs_is_named(constants: tuple[float, float, float], ter
         assert size.value == pytest.approx(nominal * truth[name], abs=5 * size.std)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("effect", ["scale_asymmetry", "scale_temperature"])
 def test_a_torquer_beside_a_rate_that_it_follows_is_in_doubt(effect: str, rng: np.random.Generator):
     """The current is read by an instrument of its own, and is the rate over the torquer's scale."""

@@ -142,6 +142,7 @@ def campaign_of(design, output: np.ndarray, *without: str) -> Campaign:
     return Campaign(columns | {"output": np.rad2deg(output)}, units | {"output": "deg/s"}, design.metadata)
 
 
+@pytest.mark.long
 def test_the_bank_says_what_a_campaign_cannot_show(rng: np.random.Generator):
     design = MOTION_DESIGNS["tumble"](rng)
     noise = rng.standard_normal(len(design.index))
@@ -193,6 +194,7 @@ def test_columns_by_x_y_z_keep_their_drivers(rng: np.random.Generator):
     assert "acceleration_z*acceleration_z" not in squared.products
 
 
+@pytest.mark.long
 def test_a_ripple_of_the_poles_of_a_tables_motor_is_its_harmonic(rng: np.random.Generator):
     """Eight poles, at speeds that change, so that it is no line: an angle as the drive turns it."""
     speed = np.repeat(rng.uniform(5.0, 25.0, 30), 20)
@@ -219,7 +221,9 @@ def told(design: str, effect: str, seed: int):
 
 
 # The verdicts below are examples, of fixed seeds; the study counts how often they are right.
-@pytest.mark.parametrize(("design", "effect"), SUITABLE)
+@pytest.mark.parametrize(
+    ("design", "effect"), [pytest.param(*case, marks=pytest.mark.long) for case in SUITABLE[::2]] + [SUITABLE[1]]
+)
 def test_hidden_effects_of_motion_are_named(design: str, effect: str):
     found, _ = told(design, effect, 1)
     assert (found.verdict, [c.effect for c in found.causes]) == ("named", [effect])

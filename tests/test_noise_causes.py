@@ -94,6 +94,7 @@ def test_a_coarse_readout_is_no_hop(monkeypatch: pytest.MonkeyPatch):
     assert telegraph(coarse, coarse, "rad/s") is not None
 
 
+@pytest.mark.long
 @pytest.mark.law
 @pytest.mark.parametrize("strength", [0.3, 0.8])
 def test_many_fast_lines_are_no_quantisation(strength: float, rng: np.random.Generator):
@@ -106,6 +107,7 @@ def test_many_fast_lines_are_no_quantisation(strength: float, rng: np.random.Gen
     assert binom.sf(false - 1, 16, 0.12) > RARE
 
 
+@pytest.mark.long
 @pytest.mark.law
 def test_hops_at_changes_of_position_are_not_the_gyros(rng: np.random.Generator):
     """Positions that begin where the level changes, and positions of three rows that have nothing to do with it."""
@@ -122,6 +124,7 @@ def test_hops_at_changes_of_position_are_not_the_gyros(rng: np.random.Generator)
     assert binom.cdf(found, 5, 0.95) > RARE
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [106, 125])
 def test_a_level_that_follows_a_column_is_no_structure(seed: int):
     """Examples where the first, unweighted search takes the scatter at high temperature rates for a function of it."""
@@ -147,6 +150,7 @@ def test_a_regular_switch_is_no_firm_noise():
         assert "switches" in (found.next_test or "")
 
 
+@pytest.mark.long
 def test_less_noise_than_stated_lacks_nothing_and_more_markov_noise_is_told():
     """Two examples of a fixed seed."""
     rng = np.random.default_rng(2)
@@ -212,6 +216,7 @@ def hopping(rng: np.random.Generator) -> gm.Campaign:
     return log(white(rng) + truth.telegraph(ROWS, STEP, *HOPS.values(), rng))
 
 
+@pytest.mark.long
 def test_stated_hops_are_simulated_and_fitted_as_what_has_their_correlation(tmp_path: Path, rng: np.random.Generator):
     """Variance p (1 - p) size², which decays as exp(-t/T), 1/T = 1/t_low + 1/t_high, of draws and in fits."""
     model = replace(gm.model_from_effects(["bias"]), noise={"noise_white": WHITE, **HOPS}).with_vector(np.array([1e-6]))

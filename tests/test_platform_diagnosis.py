@@ -104,6 +104,7 @@ def test_two_effects_are_both_named(seed: int):
     assert {c.effect for c in diagnosis.causes} == {"sync_delay", "gimbal_nonorthogonality"}
 
 
+@pytest.mark.long
 def test_a_large_delay_is_no_slope(seed: int):
     """60 ms are a phase of 86° at the highest frequency; the simulated records are of another time, no shifted ones."""
     diagnosis = found(vibration("sync_delay", 60 * MS, seed))
@@ -188,7 +189,7 @@ def test_readings_of_gimbals_that_hardly_move_hold_no_error(axis: str):
     assert (diagnosis.verdict, diagnosis.causes) == ("adequate", ())
 
 
-@pytest.mark.parametrize("axis", ["X", "Z"])
+@pytest.mark.parametrize("axis", ["X", pytest.param("Z", marks=pytest.mark.long)])
 def test_a_delay_and_friction_about_one_axis(axis: str, seed: int):
     """A corner far above all frequencies made a delay of friction, of more than a loop holds."""
     log = late_and_rubbing(2 * MS, 0.5, seed)

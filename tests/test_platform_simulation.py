@@ -122,6 +122,7 @@ def test_friction_stops_and_holds():
     assert np.abs(found.gimbals[:, :3]).max() == 0
 
 
+@pytest.mark.long
 def test_gyro_noise_turns_the_body_as_a_random_walk(seed: int):
     """By N √t: χ² of 180, five standard deviations."""
     density, runs = 1e-4, 60
@@ -176,6 +177,7 @@ def size(design: Ours, scale: jax.Array) -> jax.Array:
     return 1e6 * jnp.sum(simulate_platform(design, base, jnp.zeros((400, 3)), STEP).body[:, 1:] ** 2)
 
 
+@pytest.mark.long
 def test_derivatives_in_both_modes_are_differences():
     """Of a platform whose shafts slide; where they stick, friction of Coulomb's changes nothing."""
     design, none = Ours(), jnp.zeros(4)
@@ -222,6 +224,7 @@ def test_the_commands_name_what_was_simulated(seed: int):
     assert delay.std < 0.05
 
 
+@pytest.mark.long
 def test_logged_gyros_see_how_friction_turns_the_body(seed: int):
     """Integrated they give back the motion of the base; without them 5 arcsec of the body's are missing."""
     left = {}

@@ -125,6 +125,7 @@ def levels(step: float, rng: np.random.Generator, visits: int = 4) -> tuple[gm.C
     return gm.Campaign(columns, units, {"kind": "rate"}), np.array([1.0003, np.deg2rad(0.01)])
 
 
+@pytest.mark.long
 @pytest.mark.law
 @pytest.mark.parametrize("steps", [1.0, 3.0, 8.0])
 def test_intervals_beside_rounding_hold_the_truth(steps: float, rng: np.random.Generator):
@@ -142,6 +143,7 @@ def test_intervals_beside_rounding_hold_the_truth(steps: float, rng: np.random.G
     assert steps > 3.0 or binom.cdf(noise, 20, 0.9) > RARE
 
 
+@pytest.mark.long
 @pytest.mark.law
 def test_what_rounding_adds_is_taken_away(rng: np.random.Generator):
     """A fit that knows the steps errs less than half as much as one that takes all of rounding for noise."""
@@ -156,6 +158,7 @@ def test_what_rounding_adds_is_taken_away(rng: np.random.Generator):
     assert beside < 0.5 * plain
 
 
+@pytest.mark.long
 @pytest.mark.law
 @pytest.mark.parametrize("steps", [3.0, 12.0])
 def test_an_output_stuck_in_a_step_tells_no_more_than_that(steps: float, rng: np.random.Generator):
@@ -192,9 +195,12 @@ def hidden(case: study.Case, steps: float, seed: int = 0) -> tuple[Diagnosis, gm
     return gm.diagnose(campaign, model, hold_out=False), campaign, model
 
 
+COARSER = (("rate_temperature", 5.0), ("dynamic_rates", 10.0))
+
+
 @pytest.mark.parametrize(
     ("design", "steps"),
-    [("rate_steps", 2.0), ("rate_temperature", 5.0), ("static_cycle", 3.0), ("dynamic_rates", 10.0)],
+    [("rate_steps", 2.0), ("static_cycle", 3.0), *(pytest.param(*case, marks=pytest.mark.long) for case in COARSER)],
 )
 def test_coarse_steps_are_named_and_nothing_else(design: str, steps: float):
     """Steps that a search of the plain output takes for a function of the rate; then the simulation has them."""
@@ -223,6 +229,7 @@ def test_an_effect_beside_steps_keeps_its_name_and_size():
     assert size.value == pytest.approx(truth, abs=5.0 * size.std)
 
 
+@pytest.mark.long
 def test_a_wrong_step_of_the_simulation_is_told():
     _, campaign, model = hidden(study.Case(13, "rate_steps", "white"), 3.0)
     step = np.deg2rad(float(grid_step(campaign.columns["output"]) or 0.0))
@@ -231,6 +238,7 @@ def test_a_wrong_step_of_the_simulation_is_told():
         assert gm.diagnose(campaign, stated, hold_out=False).verdict == verdict
 
 
+@pytest.mark.long
 def test_stated_noise_is_that_before_rounding():
     """Three times its size is read where steps are ten times as large."""
     _, campaign, model = hidden(study.Case(14, "rate_temperature", "white"), 10.0)
@@ -243,6 +251,7 @@ def test_stated_noise_is_that_before_rounding():
     assert not any("noise is" in line for line in found.findings)
 
 
+@pytest.mark.long
 def test_two_levels_do_not_end_a_search():
     """A gyro that hardly leaves a step: every value but a few is the same, and a fit may leave nothing at all."""
     rng = np.random.default_rng(4)
@@ -276,7 +285,7 @@ def test_a_sweep_of_even_rates_is_no_grid(rates: int, digits: int, rng: np.rando
         assert step is None or step < 1.5e-4
 
 
-@pytest.mark.parametrize("slow", ["lag", "walk"])
+@pytest.mark.parametrize("slow", [pytest.param("lag", marks=pytest.mark.long), "walk"])
 def test_the_last_digit_of_slow_noise_is_no_step(slow: str, rng: np.random.Generator):
     """Noise of a narrow band has next to no white part, and still scatters from sample to sample."""
     drawn = rng.standard_normal(2000)
@@ -285,6 +294,7 @@ def test_the_last_digit_of_slow_noise_is_no_step(slow: str, rng: np.random.Gener
     assert "quantisation" not in {c.effect for c in found.causes}
 
 
+@pytest.mark.long
 def test_gross_errors_beside_sharp_edges_stay_left_out():
     campaign, _ = levels(10.0 * NOISE, np.random.default_rng(3))
     output = campaign.columns["output"].copy()
@@ -297,6 +307,7 @@ def test_gross_errors_beside_sharp_edges_stay_left_out():
     assert 2 <= int(said[0]) <= 8
 
 
+@pytest.mark.long
 def test_means_of_coarse_samples_have_their_noise_before_rounding():
     """A log that is averaged for the search: the steps are those of its samples, and so is what they add."""
     rng = np.random.default_rng(6)
@@ -369,7 +380,12 @@ def test_exact_outputs_of_even_rates_are_no_steps():
 
 @pytest.mark.parametrize(
     ("hidden", "scale"),
-    [("", 1.001), ("bias_temperature", 1234.5), ("scale_nonlinearity", 1.001), ("bias_periodic", 1234.5)],
+    [
+        ("", 1.001),
+        pytest.param("bias_temperature", 1234.5, marks=pytest.mark.long),
+        ("scale_nonlinearity", 1.001),
+        ("bias_periodic", 1234.5),
+    ],
 )
 def test_data_without_noise_show_what_is_hidden_and_no_rounding_of_doubles(
     hidden: str, scale: float, rng: np.random.Generator
@@ -402,6 +418,7 @@ def test_many_campaigns_in_steps_are_fitted_one_at_a_time():
     assert "one campaign at a time" in fits.reasons[0]
 
 
+@pytest.mark.long
 def test_known_steps_leave_no_doubt_of_their_own(tmp_path: Path):
     """A fit without free parameters, and a search that takes no leftover of rounding for what the model has."""
     rate = np.linspace(-3.0, 3.0, 400) + 0.013

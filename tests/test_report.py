@@ -634,6 +634,7 @@ def panels(diagnosis: Diagnosis) -> list[tuple[str, bool]]:
     return [(panel.name, panel.cause) for panel in figures(diagnosis).residuals]
 
 
+@pytest.mark.long
 def test_a_pair_of_columns_is_a_driver_too(rng: np.random.Generator, tmp_path: Path):
     diagnosis = unknown(rng)
     assert diagnosis.driver is not None
@@ -649,6 +650,7 @@ def test_a_pair_of_columns_is_a_driver_too(rng: np.random.Generator, tmp_path: P
     assert {name for name, followed in panels(turning) if followed} == {"residual-rate", "residual-rate-rate"}
 
 
+@pytest.mark.long
 def test_a_column_whose_name_has_an_and_in_it_is_no_pair(rng: np.random.Generator):
     diagnosis = unknown(rng)
     assert diagnosis.driver is not None
@@ -836,6 +838,7 @@ def test_a_covariate_whose_name_begins_as_the_output_is_drawn(rng: np.random.Gen
     assert "residual-output" not in names
 
 
+@pytest.mark.long
 def test_a_platform_is_not_told_of_commands_for_gyros(rng: np.random.Generator, tmp_path: Path):
     diagnosis = named(rng)
     assert "gyromodel compensate" in words(write_report(diagnosis, tmp_path)[0])

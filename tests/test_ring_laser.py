@@ -161,6 +161,7 @@ def test_fit_finds_the_dead_band(seed: int) -> None:
     assert found["share"] == (1.0, 0.0)
 
 
+@pytest.mark.long
 def test_fit_finds_the_lock_in_rate_behind_a_dither(seed: int) -> None:
     """From the bands at rest and at the first harmonics, the dither being known; and the band at rest by itself."""
     depth = 3.0

@@ -24,6 +24,7 @@ def sweep(rng: np.random.Generator, *, line: np.ndarray | float = 0.0, step: flo
     return gm.diagnose(campaign, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
 
 
+@pytest.mark.long
 def test_lines_of_rounding_are_not_named_a_periodic_bias(rng: np.random.Generator):
     """Samples every quarter of a step, on the way up as on the way down."""
     found = sweep(rng, step=0.05)

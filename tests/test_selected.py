@@ -13,6 +13,7 @@ from tests.test_diagnosis import ROWS, static_log
 LEAST = 3.6
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", [2.0, 3.6, 5.0, -4.0])
 def test_of_what_was_told_the_interval_holds_the_truth(size: float, rng: np.random.Generator) -> None:
     """Half of what is just large enough is told at all, and of that the plain interval holds less than 92 %."""
@@ -45,7 +46,7 @@ def test_far_above_what_is_needed_nothing_is_allowed_for() -> None:
     assert after_selection(30.0, LEAST) == pytest.approx((30 - 1.96, 30 + 1.96), abs=1e-3)
 
 
-@pytest.mark.parametrize(("slope", "widened"), [(0.036, True), (0.3, False)])
+@pytest.mark.parametrize(("slope", "widened"), [pytest.param(0.036, True, marks=pytest.mark.long), (0.3, False)])
 def test_a_weak_cause_has_the_wider_interval(slope: float, widened: bool) -> None:
     above = 15 * np.sin(2 * np.pi * 20.0 * np.arange(ROWS) / 4000.0)
     campaign = static_log(np.random.default_rng(2), slope * above)

@@ -26,6 +26,7 @@ def at_rest(temperature: np.ndarray, output: np.ndarray, **columns: np.ndarray) 
     return Campaign(data, {name: units[name] for name in data}, {"kind": "rate"})
 
 
+@pytest.mark.long
 def test_one_hinge_is_found_as_one_with_an_interval_of_its_place(rng: np.random.Generator):
     """Between the places that are searched, where two hinges around it would explain more than one of those."""
     temperature, place = cycle(600), rng.uniform(-10.0, 40.0)
@@ -43,6 +44,7 @@ def test_one_hinge_is_found_as_one_with_an_interval_of_its_place(rng: np.random.
     assert sizes["breakpoints"][1] < 1.0
 
 
+@pytest.mark.long
 def test_shapes_that_stay_as_searched_are_told_of(rng: np.random.Generator):
     """A jump between two soaks, gone through to and fro: where in between, nothing tells."""
     soaks = [-30.0, 30.0, -10.0, 50.0, 10.0, -30.0, 10.0, -10.0, 30.0, 50.0]
@@ -87,6 +89,7 @@ def test_a_curve_may_be_that_of_the_thermistor_its_temperature_is_computed_from(
         assert error == pytest.approx(reference**2 * (1 / 3800 - 1 / 3950), rel=0.2)
 
 
+@pytest.mark.long
 def test_the_same_ripple_in_bias_and_scale_factor_is_the_thermistor(rng: np.random.Generator):
     """So large an offset over temperature that the ripple shows in it as well as in the scale factor."""
     true = np.repeat(np.arange(-40.0, 61.0, 10.0), 40) + rng.uniform(-0.2, 0.2, 440) + 273.15
@@ -102,6 +105,7 @@ def test_the_same_ripple_in_bias_and_scale_factor_is_the_thermistor(rng: np.rand
     assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["thermometer_error"])
 
 
+@pytest.mark.long
 def test_the_rate_of_a_place_that_lags_by_one_time_constant_is_the_difference_of_both(rng: np.random.Generator):
     """A Shupe effect of the coil, 400 s behind the case: dT/dt of the coil is the difference over 400 s."""
     case, coil = cycle(300), np.full(300, 20.0)
@@ -125,6 +129,7 @@ def test_the_rate_of_a_place_that_lags_by_one_time_constant_is_the_difference_of
     assert row.value == pytest.approx(20.0, abs=FAR * row.std + 0.1)
 
 
+@pytest.mark.long
 def test_a_curve_that_was_found_in_slow_noise_can_be_fitted_anew():
     """From its own values; taken for white, the noise pulls a hinge beyond all temperatures."""
     case = study.Case(1322578408155778, "static_cycle", "flicker_and_walk", "bias_temperature_curve", 3.0)

@@ -64,6 +64,7 @@ def test_a_hinge_is_continuous_and_finds_the_bend():
     assert model.fit.scatter[0] < 0.5 * line.fit.scatter[0]
 
 
+@pytest.mark.long
 def test_intervals_of_breakpoints_cover(rng: np.random.Generator):
     count, inside, widths = 100, 0, []
     for _ in range(count):

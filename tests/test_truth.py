@@ -404,6 +404,7 @@ def test_oracle_of_noise_is_right_as_often_as_it_says(rng):
     assert np.mean(right) > 0.4  # a guess: 0.25
 
 
+@pytest.mark.long
 def test_oracle_of_effects_is_right_as_often_as_it_says(rng):
     """A drift or a step or neither, each as likely, of sizes from the oracle's prior, in noise of any kind."""
     rows, right, sure = 250, 0, []
@@ -434,6 +435,7 @@ def test_oracle_says_names_that_hold_95_percent():
     assert laws.Told({}, {"a": 2.9}).said == ()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("effect", "first"), [("temperature_ripple", "smooth"), ("bias_step", "bias_step")])
 def test_oracle_tells_what_is_unlisted_by_its_column(effect: str, first: str):
     evidence = study.oracle_told(study.Case(1, B, "white", effect, 10.0)).evidence

@@ -36,7 +36,7 @@ def leaked(values: np.ndarray, step: float, time_constant: float) -> np.ndarray:
     return inside
 
 
-@pytest.mark.parametrize("leak", [300.0, 500.0, 1500.0])
+@pytest.mark.parametrize("leak", [300.0, pytest.param(500.0, marks=pytest.mark.long), 1500.0])
 def test_what_follows_a_column_through_a_lag_is_told_of_that_column(leak: float, rng: np.random.Generator):
     """An altitude chamber's steps, felt through a leak of the housing, which a random walk would imitate."""
     fine = np.arange(0.0, TIME[-1] + 1.0)
@@ -49,6 +49,7 @@ def test_what_follows_a_column_through_a_lag_is_told_of_that_column(leak: float,
     assert followed(measured, "bias_temperature") == "pressure[earlier]"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("climb", [0.0, 1.0])
 def test_a_scale_factor_that_warms_up_follows_rate_and_time(climb: float, rng: np.random.Generator):
     """No step, no drift, no set of anomalous dwells, and nothing over what a thermometer's noise is smoothed to."""
@@ -156,6 +157,7 @@ def test_the_heat_of_a_torquer_follows_what_the_rate_was(rng: np.random.Generato
     assert followed(measured, "scale_factor") == "rate[earlier]"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("noise", [0.005, 0.02, 0.2])
 def test_a_measured_heat_of_a_torquer_is_temperature(noise: float, rng: np.random.Generator):
     """A bias over temperature of 400 standard deviations: what is computed of the rate, or smooths, has less noise."""
@@ -167,6 +169,7 @@ def test_a_measured_heat_of_a_torquer_is_temperature(noise: float, rng: np.rando
     assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["bias_temperature"])
 
 
+@pytest.mark.long
 def test_noise_of_a_thermometer_is_nothing_that_a_simulation_lacks(rng: np.random.Generator):
     """All that smooths explains it where the bias over temperature is known: a loop as narrow as the noise, a lag."""
     inside = chamber(rng)
@@ -217,6 +220,7 @@ def test_scale_factors_that_jump_ripple_or_lag_follow_what_they_do(change: str, 
     assert followed(measured, "scale_factor") == driver
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("error", "driver"), [("rectified", "d(rate)/dt"), ("cross product", "rate_output and rate_spin")]
 )

@@ -311,6 +311,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert runs.count('<tr><th scope="row">') == 12
 
 
+@pytest.mark.long
 def test_the_command_prints_its_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     log = read_campaign(LOG)
     write_campaign(log.select(np.isin(log.columns["segment"], [3, 4])), tmp_path / "log.csv")
