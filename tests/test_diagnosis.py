@@ -262,19 +262,25 @@ def test_calibration_is_kept_by_design(rng: np.random.Generator, tmp_path, monke
 
 @pytest.mark.parametrize(("flicker", "walk"), [(1.0, 0.0), (0.0, 0.01)])
 def test_calibration_draws_meet_the_noise_cells_they_need(flicker: float, walk: float, tmp_path, monkeypatch) -> None:
-    """S of the same draws in all noise cells; in every other level near the campaign's own it was a nat or six more."""
+    """S of the same draws in all noise cells; in every other level near the campaign's own it was a nat or six more.
+
+    And the largest are those of all draws in the cells of most.
+    """
     record = read_signals(static_log(np.random.default_rng(7)))
     ratios = NoiseRatios(jnp.asarray(flicker), jnp.asarray(walk))
     baseline = fit_record(record, gm.model_from_effects(["bias"]), ratios=ratios)
     grid = noise_grid(record.rows, record.interval, record.span)
     scanner = Scanner(record, build_bank(record), grid)
-    points = []
-    for place in ("some", "all"):
-        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / place))
-        scores = null_scores(scanner, baseline, 256, 1, lambda line, done: None)
-        points.append(np.quantile(scores, [0.5, 0.9, 0.95]))
-        monkeypatch.setattr(_calibrate, "_cells_of", lambda scanner, *_: scanner.all_cells())
-    assert np.abs(points[0] - points[1]).max() < 0.45
+    cells_of, every, found = _calibrate._cells_of, _calibrate.FEWEST_CELLS, []
+    for least, cells in ((every, cells_of), (1000, cells_of), (1000, lambda scanner, *_: scanner.all_cells())):
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / str(len(found))))
+        monkeypatch.setattr(_calibrate, "FEWEST_CELLS", least)
+        monkeypatch.setattr(_calibrate, "_cells_of", cells)
+        found.append(null_scores(scanner, baseline, 256, 1, lambda line, done: None))
+    points = [np.quantile(scores, [0.5, 0.9, 0.95]) for scores in found]
+    assert np.abs(points[0] - points[2]).max() < 0.45
+    assert not np.array_equal(found[0], found[1])
+    assert np.sort(found[0])[-8:] == pytest.approx(np.sort(found[1])[-8:], abs=1e-3)
 
 
 @pytest.mark.law
@@ -471,8 +477,8 @@ def test_many_residuals_at_once_are_searched_like_each_alone(rng: np.random.Gene
     for g in range(3):
         assert together[g].log_likelihood[7] == pytest.approx(alone[g].log_likelihood, rel=1e-9)
         for name, evidence in alone[g].evidence.items():
-            # Leading lines are corrected by their exact energy where one data set is searched.
-            within = 0.3 if name == "bias_periodic" else 1e-6
+            # Leading lines are corrected by their exact energy where one data set is searched; B of many is rounded.
+            within = 0.3 if name == "bias_periodic" else 3e-3
             assert together[g].evidence[name][7] == pytest.approx(evidence, abs=within)
 
 
