@@ -45,6 +45,7 @@ class Kept:
         self.code: str = stored.get("code", "")
         self.scale: float = stored.get("scale", 0.0)
         self.seconds: list[tuple[str, int, float, float]] = [tuple(row) for row in stored.get("seconds", [])]
+        self.timed: str = stored.get("timed", "")
         self.oracle = {label: [Told(**t) for t in told] for label, told in stored.get("oracle", {}).items()}
         self.again: tuple[str, int, int] | None = tuple(stored["again"]) if stored.get("again") else None
         self.parts = {label: [_record(r) for r in records] for label, records in stored.get("parts", {}).items()}
@@ -54,6 +55,7 @@ class Kept:
         parts = {label: [_plain(r) for r in records] for label, records in self.parts.items()}
         oracle = {label: [t._asdict() for t in told] for label, told in self.oracle.items()}
         stored = {"code": self.code, "scale": self.scale, "seconds": self.seconds, "again": self.again}
+        stored["timed"] = self.timed
         stored |= {"oracle": oracle, "parts": parts}
         text = json.dumps(stored, default=_value, separators=(",", ":"))
         self.path.parent.mkdir(parents=True, exist_ok=True)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from gyromodel._checks import listed
 from gyromodel._noise_level import with_stated_level
@@ -88,8 +89,21 @@ def diagnose(
     """
     if 0 < calibrate < FEWEST_DRAWS:
         raise ValueError(f"{calibrate} draws cannot show a 99 % point: calibrate with {FEWEST_DRAWS} or more, or 0")
-    say = progress or (lambda line, done: None)
     measured = [campaigns] if isinstance(campaigns, Campaign) else list(campaigns)
+    # Threads of BLAS would wait for one another, and for those that search side by side.
+    with threadpool_limits(1, "blas"):
+        return _diagnosed(measured, model, hold_out, calibrate, seed, progress or (lambda line, done: None))
+
+
+def _diagnosed(
+    measured: list[Campaign],
+    model: GyroModel,
+    hold_out: bool,
+    calibrate: int,
+    seed: int,
+    say: Callable[[str, float], None],
+) -> Diagnosis:
+    """`diagnose`, of one or several campaigns."""
     data = read(measured)
     record, findings, unit = data.record, list(data.findings), data.unit
     if record.domain == "gyro":
