@@ -99,8 +99,10 @@ class LineGrid:
         here = slice(self.first, self.first + len(self.frequencies))
         found = []
         for _, rows in self.runs_within(0, len(columns)):
-            spread = np.stack([np.bincount(self.index[rows], column[rows], self.length) for column in columns.T])
-            found.append(np.asarray(scipy.fft.rfft(spread.astype(columns.dtype, copy=False), axis=1))[:, here])
+            spread = np.zeros((columns.shape[1], self.length), columns.dtype)
+            for on_grid, column in zip(spread, columns.T, strict=True):
+                on_grid[:] = np.bincount(self.index[rows], column[rows], self.length)
+            found.append(np.asarray(scipy.fft.rfft(spread, axis=1))[:, here])
         both = np.concatenate(found, axis=1).T
         return np.real(both), -np.imag(both)
 
