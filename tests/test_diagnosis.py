@@ -482,6 +482,17 @@ def test_many_residuals_at_once_are_searched_like_each_alone(rng: np.random.Gene
             assert together[g].evidence[name][7] == pytest.approx(evidence, abs=within)
 
 
+def test_one_residual_beside_a_large_simulation_is_no_draw(rng: np.random.Generator) -> None:
+    """A draw's inner products are in single precision, those of data never are."""
+    record = read_signals(static_log(rng))
+    grid = NoiseGrid(NoiseRatios(jnp.zeros(1), jnp.zeros(1)), np.zeros(1), record.interval, record.span)
+    scanner = Scanner(record, build_bank(record), grid)
+    data = rng.normal(size=(len(scanner.present), 21)) * scanner.present[:, None]
+    (products,) = scanner.cells.inner_products([0], data, 20)
+    exact = scanner.bank.columns.T @ data
+    assert np.concatenate([products.baseline, products.residuals], axis=1) == pytest.approx(exact, rel=1e-12, abs=1e-12)
+
+
 @pytest.mark.law
 @pytest.mark.long
 @pytest.mark.parametrize(("size", "walk"), [(1.0, 0.0), (5.0, 0.0), (20.0, 0.0), (5.0, 0.1)])

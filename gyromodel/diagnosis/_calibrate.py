@@ -78,7 +78,7 @@ def null_scores(
     together = min(
         max(VALUES_TOGETHER // rows, LEAST_TOGETHER), MOST_TOGETHER, -(-draws // LEAST_TOGETHER) * LEAST_TOGETHER
     )
-    first = scanner.checked(cells) if len(cells) >= FEWEST_CELLS else cells
+    first = (scanner.checked(cells) if len(cells) >= FEWEST_CELLS else []) or cells
     rest, scores = [g for g in cells if g not in first], []
     for start in range(0, draws, together):
         drawn = draw(together)

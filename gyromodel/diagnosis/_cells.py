@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gyromodel.diagnosis._bank import Bank
+from gyromodel.diagnosis._evidence import FEW_SETS
 from gyromodel.diagnosis._lines import LineGrid
 from gyromodel.estimate import make_filter, whiten_columns
 from gyromodel.noise import NoiseGrid
@@ -173,13 +174,16 @@ class Cells:
     def inner_products(self, group: Sequence[int], data: np.ndarray, exact: int) -> list[Products]:
         """Per cell of a group, V⁻¹x of the data's columns and its inner products with the candidates' columns.
 
-        Of so many data that they are draws, all columns but the first `exact` have theirs in single precision.
+        Where all columns but the first `exact` are so many that they are draws, they have theirs in single precision.
         """
         columns = data.shape[1]
         step = FEW_STEP if columns <= FEW_COLUMNS else COLUMN_STEP
         data = np.pad(data, ((0, 0), (0, -columns % step)))
         if columns > FEW_COLUMNS:
             z = np.asarray(precision(self[group[0]].filter, data))[:, :columns]
+            if columns - exact <= FEW_SETS:
+                cross = self._columns.T @ z
+                return [Products(z, cross[:, :exact], cross[:, exact:])]
             drawn = np.ascontiguousarray(z[:, exact:], np.float32)
             return [Products(z, self._columns.T @ z[:, :exact], self._single.T @ drawn)]
         filters = [self[g].filter for g in (*group, *[group[0]] * (CELLS_TOGETHER - len(group)))]
