@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -12,6 +11,7 @@ from threadpoolctl import threadpool_limits
 from gyromodel._checks import listed
 from gyromodel._noise_level import with_stated_level
 from gyromodel.campaign import Campaign
+from gyromodel.diagnosis._account import evidence_at_sizes, more_needed, p_value_of, rounds_of
 from gyromodel.diagnosis._calibrate import null_scores, threshold_of
 from gyromodel.diagnosis._data import Data, read
 from gyromodel.diagnosis._extended import finished, stated_counts, stated_hops, stated_level
@@ -21,8 +21,8 @@ from gyromodel.diagnosis._isolation import settling_test
 from gyromodel.diagnosis._misfit import excess_band, unexplained_axes
 from gyromodel.diagnosis._noise_causes import as_cause, quantisation, telegraph
 from gyromodel.diagnosis._points import dwells_apart
-from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, cells_of_weight, is_driver, is_noise, noise_kinds
-from gyromodel.diagnosis._result import Candidate, Cause, Diagnosis, Gain, ParameterValue, Round
+from gyromodel.diagnosis._ranking import SLOW_IN_TIME, cells_of_weight, noise_kinds
+from gyromodel.diagnosis._result import Cause, Diagnosis, Gain, ParameterValue
 from gyromodel.diagnosis._search import Progress, Selection
 from gyromodel.diagnosis._session import (
     Session,
@@ -34,7 +34,6 @@ from gyromodel.diagnosis._session import (
     without_axis,
 )
 from gyromodel.diagnosis._shapes import driver_shape, minimum_detectable, not_testable
-from gyromodel.diagnosis._steps import Found
 from gyromodel.diagnosis._variance import follow, growing_noise, noise_level, tails
 from gyromodel.diagnosis._verdict import FAINT, judge, structured, with_noise, with_steps
 from gyromodel.estimate import (
@@ -291,14 +290,14 @@ def _diagnosed(
         | ({"quantisation": readings.untested} if readings.untested else {}),
         noise=extended.noise_table(),
         noise_kinds={} if baseline.noise_given else noise_kinds(session.scanner, selection.last),
-        evidence=_evidence(selection, judgement.credible_set),
-        rounds=_rounds(session, selection, scale, hold_out),
+        evidence=evidence_at_sizes(selection, judgement.credible_set),
+        rounds=rounds_of(session, selection, scale, hold_out),
         credible_set=judgement.credible_set,
         unexplained=judgement.unexplained,
         findings=(*findings, *judgement.findings),
-        threshold=session.threshold + _more_needed(rankings[0], selection.path),
+        threshold=session.threshold + more_needed(rankings[0], selection.path),
         threshold_kind="calibrated" if calibrate else "safe",
-        p_value=_p_value(selection, nulls) if calibrate else None,
+        p_value=p_value_of(selection, nulls) if calibrate else None,
         searched=tuple(
             dict.fromkeys(
                 [*names, *(name for r in rankings for name in r.tangents), *["quantisation"] * steps_searched]
@@ -363,30 +362,6 @@ def _like_hops(selection: Selection, free: Estimate) -> bool:
     return in_time and selection.driver in (None, "smooth(time)") and (slow or bool(selection.found))
 
 
-def _more_needed(first: Ranking, path: Sequence[Found]) -> float:
-    """Nats that the first name, or the leading one where none was added, needed more."""
-    name = path[0].name if path else first.best(drivers=False)[0]
-    return first.more_needed(name) if name else 0.0
-
-
-def _evidence(selection: Selection, alike: Mapping[str, float]) -> dict[str, tuple[float, ...]]:
-    """ln B at each of the prior's sizes beside all that was found; of that, and of what is alike, as it was added.
-
-    Gross errors are a campaign's own.
-    """
-    of = dict.fromkeys(selection.last.statistic, selection.last)
-    for f in reversed(selection.found):
-        rivals = alike if f.name in alike else ()
-        of |= {name: f.ranking for name in (*rivals, f.name) if name in f.ranking.statistic}
-    return {name: ranking.at_sizes(name) for name, ranking in sorted(of.items()) if name != "outliers"}
-
-
-def _p_value(selection: Selection, nulls: np.ndarray) -> float:
-    """Share of campaigns with nothing hidden whose best candidate has as much evidence; this one is counted."""
-    first = selection.path[0].ranking if selection.path else selection.last
-    return float((1 + np.sum(nulls >= first.significance)) / (1 + len(nulls)))
-
-
 def _gain(session: Session, baseline: Estimate, selection: Selection, unit: str, scale: float, ordinary, say) -> Gain:
     if not any(f.effect is not None or f.frees_noise for f in selection.found):
         return no_gain(session.record, baseline, unit, scale)
@@ -407,35 +382,3 @@ def _gain(session: Session, baseline: Estimate, selection: Selection, unit: str,
         ordinary,
         lambda k, n: say(f"held-out block {k} of {n}", 0.7 + 0.28 * k / n),
     )
-
-
-def _rounds(session: Session, selection: Selection, scale: float, hold_out: bool) -> tuple[Round, ...]:
-    steps: list[tuple[Found | None, Ranking, Estimate]] = [
-        (f, f.ranking, e) for f, e in zip(selection.path, selection.estimates[1:], strict=False)
-    ]
-    rounds = []
-    unknown = (np.nan, np.nan, False)
-    before = session.ladder(selection.estimates[0]) if hold_out else unknown
-    rounds.append(
-        Round(
-            None,
-            0.0,
-            _ranking(selection.path[0].ranking if selection.path else selection.last),
-            before[0] * scale,
-            before[1],
-        )
-    )
-    for step, ranking, estimate in steps:
-        assert step is not None
-        rms, score, _ = session.ladder(estimate) if hold_out else unknown
-        rounds.append(Round(step.name, ranking.statistic[step.name], _ranking(ranking), rms * scale, score))
-    return tuple(rounds)
-
-
-def _ranking(ranking: Ranking) -> tuple[Candidate, ...]:
-    order = sorted(ranking.statistic, key=lambda k: -ranking.statistic[k])[:12]
-    return tuple(Candidate(str(k), ranking.statistic[k], ranking.posterior[k], _kind(k)) for k in order)
-
-
-def _kind(name: str) -> Literal["effect", "driver", "noise"]:
-    return "driver" if is_driver(name) else "noise" if is_noise(name) else "effect"
