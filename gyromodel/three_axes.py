@@ -34,6 +34,7 @@ class Triad:
         rotation: by which the three axes are turned together about x, y and z: what another mounting takes away.
         squareness: by how much less than a right angle x and y, y and z, z and x enclose: what no mounting changes.
         not_told: why the covariances are not to be believed; empty where they are.
+        left_out: how many campaigns do not count, as their unit hardly turned about an axis.
     """
 
     rotation: Float[np.ndarray, " axis"]
@@ -41,6 +42,7 @@ class Triad:
     squareness: Float[np.ndarray, " axis"]
     squareness_covariance: Float[np.ndarray, "axis axis"]
     not_told: str = ""
+    left_out: int = 0
 
     @property
     def turned(self) -> bool:
@@ -54,6 +56,10 @@ class Triad:
 
     def sentence(self) -> str:
         """What the axes say together."""
+        few = "a campaign" if self.left_out == 1 else f"{self.left_out} campaigns"
+        return self._told() + (f" Without {few} that hardly turned about an axis." if self.left_out else "")
+
+    def _told(self) -> str:
         if self.not_told:
             return f"How the axes lie together is not told: {self.not_told}."
         turned = f"turned as a whole by {_listed(self.rotation, self.rotation_covariance, 'xyz')}"
@@ -77,6 +83,7 @@ class Triad:
 
         return {
             "not_told": self.not_told or None,
+            "campaigns_left_out": self.left_out,
             "rotation": part(self.rotation, self.rotation_covariance, "xyz", self.turned),
             "squareness": part(self.squareness, self.squareness_covariance, ("xy", "yz", "zx"), self.oblique),
         }
@@ -92,6 +99,8 @@ def triad(campaigns: Sequence[Campaign], extended: Mapping[str, Estimate]) -> Tr
     rated = [with_reference_rates(c)[0] for c in campaigns]
     if any(set(AXES) - set(extended) or not {f"rate_{a}" for a in AXES} <= set(c.columns) for c in rated):
         return None
+    # Beside campaigns that turn about every axis, one that does not would add its reference's errors as leans.
+    used = [k for k, c in enumerate(rated) if not _hardly_turned([c])] or list(range(len(rated)))
     lean, covariance = np.zeros((3, 3)), np.zeros((9, 9))
     for i, axis in enumerate(AXES):
         others = [j for j in range(3) if j != i]
@@ -100,7 +109,7 @@ def triad(campaigns: Sequence[Campaign], extended: Mapping[str, Estimate]) -> Tr
         if "misalignment" in model.labels:
             model = model.without("misalignment")
         try:
-            fitted = fit([c.axis(axis) for c in campaigns], model.with_effect(Misalignment(about=about)))
+            fitted = fit([campaigns[k].axis(axis) for k in used], model.with_effect(Misalignment(about=about)))
         except (EstimateError, ModelError):
             return None
         angles = fitted.propagate(lambda m: m.effects[m.labels.index("misalignment")].linear())
@@ -114,7 +123,12 @@ def triad(campaigns: Sequence[Campaign], extended: Mapping[str, Estimate]) -> Tr
         square[k, [3 * i + j, 3 * j + i]] = 1.0
     flat = lean.ravel()
     return Triad(
-        turn @ flat, turn @ covariance @ turn.T, square @ flat, square @ covariance @ square.T, _hardly_turned(rated)
+        turn @ flat,
+        turn @ covariance @ turn.T,
+        square @ flat,
+        square @ covariance @ square.T,
+        _hardly_turned([rated[k] for k in used]),
+        len(rated) - len(used),
     )
 
 

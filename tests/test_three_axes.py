@@ -42,11 +42,15 @@ def measured(axes: np.ndarray, rng: np.random.Generator, size: np.ndarray = TURN
     return Campaign(columns, {n: "s" if n == "time" else "deg/s" for n in columns}, {"kind": "rate"})
 
 
-def lie(axes: np.ndarray, rng: np.random.Generator, size: np.ndarray = TURNS) -> Triad:
-    campaign = measured(axes, rng, size)
-    found = triad([campaign], {a: fit(campaign.axis(a), model_from_effects(["scale_factor", "bias"])) for a in "xyz"})
+def lie_of(*campaigns: Campaign) -> Triad:
+    model = model_from_effects(["scale_factor", "bias"])
+    found = triad(campaigns, {a: fit([c.axis(a) for c in campaigns], model) for a in "xyz"})
     assert found is not None
     return found
+
+
+def lie(axes: np.ndarray, rng: np.random.Generator, size: np.ndarray = TURNS) -> Triad:
+    return lie_of(measured(axes, rng, size))
 
 
 def test_a_turned_unit_is_turned_and_square(rng: np.random.Generator):
@@ -80,6 +84,18 @@ def test_a_lean_wants_all_three_axes_turned(rng: np.random.Generator):
     assert not still.turned
     assert "not told: the rotation about z" in still.sentence()
     assert str(still.to_dict()["not_told"]) in still.sentence()
+
+
+def test_a_campaign_that_hardly_turns_does_not_count_beside_one_that_does(rng: np.random.Generator):
+    """Its reference errs by 400 arcsec of the fastest rotation: a lean that the unit does not have."""
+    axes = np.eye(3)
+    axes[1] = Rotation.from_rotvec([0, 0, 400 * ARCSEC]).apply([0.0, 1.0, 0.0])
+    erring, other = (measured(axes, rng, np.array([60.0, 3.0, 3.0])) for _ in range(2))
+    found = lie_of(measured(np.eye(3), rng), erring)
+    assert not found.oblique
+    assert found.sentence().endswith("Without a campaign that hardly turned about an axis.")
+    assert found.to_dict()["campaigns_left_out"] == 1
+    assert "not told" in lie_of(erring, other).sentence()
 
 
 @pytest.mark.law
