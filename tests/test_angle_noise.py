@@ -46,7 +46,6 @@ def stated(*effects: str, white: float = N, angle: float = Q) -> gm.GyroModel:
     return replace(gm.model_from_effects(list(effects)), noise={"noise_white": white, "noise_quantisation": angle})
 
 
-@pytest.mark.long
 @pytest.mark.law
 def test_both_kinds_have_their_size_and_fits_the_uncertainty_that_they_leave(rng: np.random.Generator):
     """Taken for white noise of the rate, the counts would make the bias eight times as uncertain."""
@@ -107,7 +106,9 @@ def test_an_effect_below_what_counts_as_white_noise_is_named(rng: np.random.Gene
     assert found.verdict in ("named", "ambiguous")
     assert "bias_temperature" in {c.effect for c in found.causes}
     assert "noise_quantisation" in found.noise
-    assert "noise_quantisation" in next(iter(found.noise_kinds))
+    first = next(iter(found.noise_kinds))
+    # Flicker that is not there has the larger share in four of ten logs.
+    assert first in ("noise_white + noise_quantisation", "noise_white + noise_flicker + noise_quantisation")
 
 
 def test_an_extended_model_states_what_was_found_and_is_adequate(tmp_path: Path, rng: np.random.Generator):
@@ -135,7 +136,8 @@ def test_what_falls_apart_otherwise_is_no_firm_count(kind: str, rng: np.random.G
     left = (np.diff(noise, 2) / np.sqrt(6.0) if twice else lfilter([0.8], [1.0, 0.6], noise))[-ROWS:]
     model = replace(gm.model_from_effects(["bias"]), noise={"noise_white": N})
     found = gm.diagnose(log(4e-5 + N / np.sqrt(STEP) * left), model, hold_out=False)
-    assert found.verdict != "named"
+    assert (found.verdict, found.causes) == ("adequate", ())
+    assert any("does not explain what is left" in line for line in found.findings)
 
 
 def test_many_fits_are_those_of_one_by_one(rng: np.random.Generator):

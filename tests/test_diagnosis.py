@@ -24,6 +24,7 @@ from gyromodel.averages import average
 from gyromodel.diagnosis import Cause, _calibrate
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._calibrate import null_scores
+from gyromodel.diagnosis._data import read
 from gyromodel.diagnosis._epochs import epoch_interval
 from gyromodel.diagnosis._evidence import (
     SAFE_THRESHOLD,
@@ -182,7 +183,6 @@ def test_explained_for_inverts_the_evidence() -> None:
     assert float(log_evidence_ratio(np.array(t), 900.0, 900, 1)) == pytest.approx(5.0, abs=1e-6)
 
 
-@pytest.mark.long
 def test_units_of_the_output_change_nothing(seed: int) -> None:
     ramp = 8.0 * np.sin(2 * np.pi * 20.0 * np.arange(ROWS) / 4000.0)
     found = []
@@ -450,23 +450,27 @@ def test_a_stated_noise_level_is_held_against_the_data(rng: np.random.Generator)
     assert float(said.split()[3]) == pytest.approx(2.0, abs=0.4)
 
 
-def test_line_energies_are_the_whitened_ones(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("campaigns", [1, 2])
+def test_line_energies_are_the_whitened_ones(campaigns: int, rng: np.random.Generator) -> None:
     """At every frequency, in white noise and in a random walk; there a cosine begins with a jump, a sine with none."""
-    record = read_signals(static_log(rng))
+    record = read([static_log(rng) for _ in range(campaigns)]).record
     ratios = NoiseRatios(jnp.array([0.0, 0.0, 0.3]), jnp.array([0.0, 0.5, 0.0]))
     scanner = Scanner(record, build_bank(record), NoiseGrid(ratios, np.zeros(3), record.interval, record.span))
     assert scanner.lines is not None
-    waves = scanner.lines.waves(np.arange(len(scanner.lines.frequencies)))
+    waves = scanner.lines.waves(np.arange(campaigns * len(scanner.lines.frequencies)))
     for g in range(3):
         cosine, sine = np.split(scanner.cells.whiten(g, waves), 2, axis=1)
         found = scanner.cells[g].line
         assert found[:, 0, 0] == pytest.approx(np.sum(cosine**2, axis=0), rel=0.1)
         assert found[:, 1, 1] == pytest.approx(np.sum(sine**2, axis=0), rel=0.1)
+        both = np.sqrt(found[:, 0, 0] * found[:, 1, 1])
+        assert found[:, 0, 1] / both == pytest.approx(np.sum(cosine * sine, axis=0) / both, abs=0.1)
 
 
-def test_many_residuals_at_once_are_searched_like_each_alone(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("campaigns", [1, 2])
+def test_many_residuals_at_once_are_searched_like_each_alone(campaigns: int, rng: np.random.Generator) -> None:
     """Few residuals are searched in several noise cells side by side, many in one cell at a time."""
-    record = read_signals(static_log(rng))
+    record = read([static_log(rng) for _ in range(campaigns)]).record
     ratios = NoiseRatios(jnp.array([0.0, 0.3, 0.3]), jnp.array([0.0, 0.0, 0.5]))
     grid = NoiseGrid(ratios, np.zeros(3), record.interval, record.span)
     scanner = Scanner(record, build_bank(record), grid)

@@ -7,10 +7,11 @@ from collections.abc import Callable
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.stats import binom
 
 import gyromodel as gm
-from gyromodel.diagnosis._misfit import excess_band, unsteady_lines
+from gyromodel.diagnosis._misfit import excess_band, lines_of_noise, unsteady_lines
 from gyromodel.effects.drivers import Bias, BiasPeriodic
 from gyromodel.estimate import fit_record
 from gyromodel.model import GyroModel
@@ -96,3 +97,14 @@ def test_two_errors_side_by_side_are_no_band(rng: np.random.Generator) -> None:
     noise = rng.standard_normal(ROWS)
     noise[[500, 503]] = 40.0
     assert excess_band(fit_record(read_signals(log(noise)), GyroModel((Bias(),), {}))) is None
+
+
+@pytest.mark.parametrize(("size", "of_noise"), [(0.0, True), (2.0, False)])
+def test_a_line_is_held_against_the_band_about_it(size: float, of_noise: bool, rng: np.random.Generator) -> None:
+    """In noise that turns its sign from sample to sample, the greatest of its own lines, and one far above these."""
+    white = NoiseRatios(jnp.zeros(()), jnp.zeros(()))
+    output = lfilter([0.8], [1.0, 0.6], rng.standard_normal(ROWS)) + size * np.cos(2 * np.pi * 0.45 * TIME)
+    greatest = 400 + np.argmax(np.abs(np.fft.rfft(output))[400 : ROWS // 2])
+    line = BiasPeriodic(cosine=np.zeros(1), sine=np.zeros(1), frequency=np.array([greatest / ROWS]))
+    fitted = fit_record(read_signals(log(output)), GyroModel((Bias(), line), {}), ratios=white)
+    assert lines_of_noise(fitted) == [of_noise]

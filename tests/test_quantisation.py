@@ -294,7 +294,6 @@ def test_the_last_digit_of_slow_noise_is_no_step(slow: str, rng: np.random.Gener
     assert "quantisation" not in {c.effect for c in found.causes}
 
 
-@pytest.mark.long
 def test_gross_errors_beside_sharp_edges_stay_left_out():
     campaign, _ = levels(10.0 * NOISE, np.random.default_rng(3))
     output = campaign.columns["output"].copy()

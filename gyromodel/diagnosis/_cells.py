@@ -185,7 +185,7 @@ class Cells:
                 cross = self._columns.T @ z
                 return [Products(z, cross[:, :exact], cross[:, exact:])]
             drawn = np.ascontiguousarray(z[:, exact:], np.float32)
-            return [Products(z, self._columns.T @ z[:, :exact], self._single.T @ drawn)]
+            return [Products(z, self._columns.T @ z[:, :exact], self._columns_single.T @ drawn)]
         filters = [self[g].filter for g in (*group, *[group[0]] * (CELLS_TOGETHER - len(group)))]
         gain, scale = (np.stack([np.asarray(getattr(f, part)) for f in filters], axis=-1) for part in ("gain", "scale"))
         z = np.asarray(precision(filters[0]._replace(gain=gain, scale=scale), data))[:, :columns, : len(group)]
@@ -194,7 +194,7 @@ class Cells:
         return [Products(z[:, i], cross[:, i, :exact], cross[:, i, exact:]) for i in range(len(group))]
 
     @cached_property
-    def _single(self) -> np.ndarray:
+    def _columns_single(self) -> np.ndarray:
         """The candidates' columns in single precision."""
         return self._columns.astype(np.float32)
 

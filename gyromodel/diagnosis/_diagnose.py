@@ -219,8 +219,8 @@ def _diagnosed(
         stepped = quantisation(free, session.threshold, last if last.noise_given else None)
     if plain and not selection.unresolved and (band := excess_band(free or selection.estimate)):
         findings.append(band.told)
-    # Where a band is left besides, neighbours fall apart otherwise than a count's errors do.
-    if stepped is not None and band is not None:
+    # Where a band of the faster half is left besides, neighbours fall apart otherwise than a count's errors do.
+    if stepped is not None and band is not None and band.high > 0.25 / record.interval:
         stepped = None
     if stepped is not None:
         beyond.append(stepped)

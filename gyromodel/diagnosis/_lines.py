@@ -17,9 +17,9 @@ from gyromodel.effects.drivers import BiasPeriodic
 from gyromodel.model import GyroModel
 from gyromodel.signals import Record
 
-# A line's energy is computed exactly at the lowest frequencies, at log-spaced ones to interpolate between, and at the
-# leading peaks of each pass, whose correction holds for their neighbours too.
-LOWEST_LINES, SPACED_LINES, PEAKS, PEAK_WIDTH = 24, 24, 12, 6
+# A line's energy is computed exactly at the lowest and the highest frequencies, at log-spaced ones to interpolate
+# between, and at the leading peaks of each pass, whose correction holds for their neighbours too.
+LOWEST_LINES, SPACED_LINES, HIGHEST_LINES, PEAKS, PEAK_WIDTH = 24, 24, 12, 12, 6
 # Lines closer than this many steps of the grid (a quarter of the resolution each) are one that is not steady.
 RESOLVED = 4
 # Fewer cycles in the record than this are a trend, not a line.
@@ -143,12 +143,14 @@ def line_grid(record: Record) -> LineGrid | None:
     length = cast(int, scipy.fft.next_fast_len(int(np.ceil(4.0 * (span + grid) / grid)), real=True))
     first = int(np.ceil(FEWEST_CYCLES / span * length * grid))
     frequencies = np.arange(first, length // 2 + 1) / (length * grid)
-    frequencies = frequencies[frequencies < 0.5 / record.interval * (1 - 0.5 / record.rows)]
+    # Nearer to half the sample rate than half the resolution, a sine fades.
+    frequencies = frequencies[frequencies < 0.5 / record.interval - 0.49 / (span + record.interval)]
     if not len(frequencies):
         return None
     exact = np.arange(min(LOWEST_LINES, len(frequencies)))
     spaced = np.geomspace(len(exact) + 1, len(frequencies), SPACED_LINES).round().astype(int) - 1
-    exact = np.unique(np.concatenate([exact, np.clip(spaced, 0, len(frequencies) - 1)]))
+    highest = np.arange(len(frequencies) - HIGHEST_LINES, len(frequencies))
+    exact = np.unique(np.concatenate([exact, spaced, highest]).clip(0, len(frequencies) - 1))
     index = np.minimum(np.round(time / grid).astype(int), length - 1)
     angle = 2.0 * np.pi * np.arange(length) / length
     run = record.run

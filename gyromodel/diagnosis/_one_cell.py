@@ -85,11 +85,14 @@ class OneCell:
             own = self._cell.blocks[q]
             c = self._cross_j[start : start + q * count].reshape(count, q, -1)
             b = self._cross_y[start : start + q * count].reshape(count, q, draws)
-            norm = np.sqrt(np.maximum(np.einsum("bii->bi", own), 1e-300))
+            of_own = np.einsum("bii->bi", own)
+            norm = np.sqrt(np.maximum(of_own, 1e-300))
             a = (own - c @ c.transpose(0, 2, 1)) / (norm[:, :, None] * norm[:, None, :])
             values, vectors = np.linalg.eigh(a)
             keep = values > VANISHED
-            along = (vectors.transpose(0, 2, 1) / norm[:, None, :]).astype(kind) @ b
+            # A column without energy, beside the others of its block, has no direction that single precision holds.
+            length = np.where(of_own > 1e-40 * of_own.max(axis=1, keepdims=True), norm, np.inf)
+            along = (vectors.transpose(0, 2, 1) / length[:, None, :]).astype(kind) @ b
             inverse = np.where(keep, 1.0 / np.where(keep, values, 1.0), 0.0).astype(kind)
             t = np.sum(inverse[:, :, None] * along**2, axis=1)
             here = slice(first, first + count)

@@ -164,4 +164,4 @@ def robust_orders(columns: np.ndarray, data: np.ndarray) -> Iterator[tuple[np.nd
         able = np.flatnonzero(np.count_nonzero(misfit <= least, axis=1) > half)
         median = np.partition(misfit[able], half, axis=1)[:, half]
         best = misfit[able[np.argmin(median)]]
-        yield np.argsort(-best), float(best.max() / max(1.4826 * float(median.min()), 1e-300))
+        yield np.argsort(-best), float(best.max()) / max(1.4826 * float(median.min()), 1e-300)
