@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from gyromodel.diagnosis._cells import Products
     from gyromodel.diagnosis._scan import Scanner
 
+# A column's energy, as a part of the greatest of its block, that single precision takes for none.
+NOTHING = 1e-40
 # Of what giving up points explains, the part of a sum that is rounding.
 SINGULAR = 1e-10
 # Standard deviations below zero that a coefficient which cannot be negative may be found at.
@@ -85,18 +87,17 @@ class OneCell:
             own = self._cell.blocks[q]
             c = self._cross_j[start : start + q * count].reshape(count, q, -1)
             b = self._cross_y[start : start + q * count].reshape(count, q, draws)
-            of_own = np.einsum("bii->bi", own)
-            norm = np.sqrt(np.maximum(of_own, 1e-300))
+            square = np.einsum("bii->bi", own)
+            # A column that is nothing beside the others of its block has no direction.
+            norm = np.sqrt(np.where(square > NOTHING * square.max(axis=1, keepdims=True), square, np.inf))
             a = (own - c @ c.transpose(0, 2, 1)) / (norm[:, :, None] * norm[:, None, :])
             values, vectors = np.linalg.eigh(a)
             keep = values > VANISHED
-            # A column without energy, beside the others of its block, has no direction that single precision holds.
-            length = np.where(of_own > 1e-40 * of_own.max(axis=1, keepdims=True), norm, np.inf)
-            along = (vectors.transpose(0, 2, 1) / length[:, None, :]).astype(kind) @ b
+            along = (vectors.transpose(0, 2, 1) / norm[:, None, :]).astype(kind) @ b
             inverse = np.where(keep, 1.0 / np.where(keep, values, 1.0), 0.0).astype(kind)
             t = np.sum(inverse[:, :, None] * along**2, axis=1)
             here = slice(first, first + count)
-            out = b[:, 0] < (table.smallest[here] * a[:, 0, 0] * norm[:, 0] ** 2)[:, None]
+            out = b[:, 0] < (table.smallest[here] * a[:, 0, 0] * square[:, 0])[:, None]
             if q > 1 and table.positive[here].any():
                 # What would be clearly negative in one of its coefficients.
                 sizes = vectors @ (inverse[:, :, None] * along)
@@ -105,7 +106,7 @@ class OneCell:
                 out = (sizes < -CLEARLY * spread[:, :, None] * noise[:, None, :]).any(axis=1)
             t_of[here] = np.where(table.positive[here, None] & out, 0.0, t)
             q_of[here] = keep.sum(1)
-            energy[here] = np.sum(values * keep, axis=1) / np.maximum(q_of[here], 1) * np.mean(norm**2, axis=1)
+            energy[here] = np.sum(values * keep, axis=1) / np.maximum(q_of[here], 1) * np.mean(square, axis=1)
         # A form that loses more columns than the baseline contains is another form in disguise.
         sound = (q_of >= least) & ~lost
         energy[~sound] = 0.0
