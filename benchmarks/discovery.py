@@ -28,6 +28,7 @@ import numpy as np
 
 from benchmarks._discovery_page import SIZES, TIMED_DRAWS, asked, write_page
 from benchmarks._kept import Kept, code
+from gyromodel._compiling import keep_compiled, switch_compiler
 from tests.truth import study
 from tests.truth.campaigns import HOMES, MOTION, A, B, C
 from tests.truth.noise import FAMILY, OUTSIDE
@@ -75,19 +76,22 @@ def _timed(seed: int, designs: Sequence[str] = TIMED) -> list[tuple[str, int, fl
 
     The second finds what the first has compiled, and has other campaigns, as draws are kept too.
     """
-    places = ("XDG_CACHE_HOME", "JAX_COMPILATION_CACHE_DIR")
-    kept, found = {name: os.environ[name] for name in places if name in os.environ}, []
+    kept, found = dict(os.environ), []
     with tempfile.TemporaryDirectory() as cache:
-        os.environ |= dict.fromkeys(places, cache)  # read by the new processes
         try:
+            # As commands have it, read by the new processes.
+            for name in ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "XLA_FLAGS"):
+                os.environ.pop(name, None)
+            os.environ["XDG_CACHE_HOME"] = cache
+            keep_compiled()
+            switch_compiler()
             for first in (seed, seed + len(designs)):
                 cases = [study.Case(first + i, name, "flicker", None) for i, name in enumerate(designs)]
                 with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
                     found.append(list(pool.map(_seconds, cases)))
         finally:
-            for name in places:
-                os.environ.pop(name)
-            os.environ |= kept
+            os.environ.clear()
+            os.environ.update(kept)
     return [(name, rows, one, two) for name, (rows, one), (_, two) in zip(designs, *found, strict=True)]
 
 

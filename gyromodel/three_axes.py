@@ -19,8 +19,8 @@ from gyromodel.units import factor
 
 # A rotation or a deviation from right angles is one beyond this chance.
 SIGNIFICANT = 1e-3
-# Part of the fastest axis' rotation (rms) below which another hardly turns: what a reference errs by goes with the
-# fastest, moves with it as no noise does, and is then as large as what leans are told by.
+# Part of the fastest rotation (rms) below which that about another direction is hardly one: what a reference errs by
+# goes with the fastest, moves with it as no noise does, and is then as large as what leans are told by.
 HARDLY = 0.1
 # Pairs of axes as deviations from right angles are listed: xy, yz, zx.
 PAIRS = ((0, 1), (1, 2), (2, 0))
@@ -34,7 +34,7 @@ class Triad:
         rotation: by which the three axes are turned together about x, y and z: what another mounting takes away.
         squareness: by how much less than a right angle x and y, y and z, z and x enclose: what no mounting changes.
         not_told: why the covariances are not to be believed; empty where they are.
-        left_out: how many campaigns do not count, as their unit hardly turned about an axis.
+        left_out: how many campaigns do not count, as their unit hardly turned about some direction.
     """
 
     rotation: Float[np.ndarray, " axis"]
@@ -57,7 +57,7 @@ class Triad:
     def sentence(self) -> str:
         """What the axes say together."""
         few = "a campaign" if self.left_out == 1 else f"{self.left_out} campaigns"
-        return self._told() + (f" Without {few} that hardly turned about an axis." if self.left_out else "")
+        return self._told() + (f" Without {few} that hardly turned about some direction." if self.left_out else "")
 
     def _told(self) -> str:
         if self.not_told:
@@ -133,15 +133,19 @@ def triad(campaigns: Sequence[Campaign], extended: Mapping[str, Estimate]) -> Tr
 
 
 def _hardly_turned(rated: Sequence[Campaign]) -> str:
-    """Which axis the unit hardly turned about, beside another; empty where there is none."""
+    """Which direction the unit hardly turned about, beside another; empty where there is none."""
     rates = np.stack([np.concatenate([c.si(f"rate_{a}") for c in rated]) for a in AXES])
-    size = np.sqrt(np.nanmean(rates**2, axis=1)) * factor("rad/s", "deg/s")
-    least, most = int(size.argmin()), int(size.argmax())
-    if size[least] > HARDLY * size[most]:
+    rates = rates[:, np.isfinite(rates).all(axis=0)]
+    # Of the principal directions, which no mounting moves.
+    square, directions = np.linalg.eigh(rates @ rates.T / max(rates.shape[1], 1))
+    size = np.sqrt(np.maximum(square, 0.0)) * factor("rad/s", "deg/s")
+    if size[0] > HARDLY * size[-1]:
         return ""
+    least, most = (AXES[int(np.abs(directions[:, k]).argmax())] for k in (0, -1))
     return (
-        f"the rotation about {AXES[least]} ({size[least]:.2g} deg/s rms) is a tenth or less of that about {AXES[most]} "
-        f"({size[most]:.2g} deg/s), so that errors of the reference pass for leans; turn the unit about all three axes"
+        f"the rotation about a direction near {least} ({size[0]:.2g} deg/s rms) is a tenth or less of that about one "
+        f"near {most} ({size[-1]:.2g} deg/s), so that errors of the reference pass for leans; turn the unit about all "
+        "three axes"
     )
 
 

@@ -111,6 +111,7 @@ def test_an_effect_below_what_counts_as_white_noise_is_named(rng: np.random.Gene
     assert first in ("noise_white + noise_quantisation", "noise_white + noise_flicker + noise_quantisation")
 
 
+@pytest.mark.long
 def test_an_extended_model_states_what_was_found_and_is_adequate(tmp_path: Path, rng: np.random.Generator):
     first = gm.diagnose(counted(rng, 8e-3), gm.model_from_effects(["bias"]), hold_out=False)
     gm.write_model(first.extended, tmp_path / "extended.yaml")

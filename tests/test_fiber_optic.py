@@ -63,6 +63,7 @@ def test_the_terms_of_the_environment_are_those_of_the_heat_in_the_coil():
     assert found["bias_temperature_gradient_rate"][0] == pytest.approx(1500.0, rel=0.1)
 
 
+@pytest.mark.long
 def test_a_hidden_gradient_is_named():
     """A third of it is 2.3 standard deviations from the rate of a coil that follows the case through one lag."""
     log = truth.log(truth.Gyro(gradient=15.0), 3.0, np.random.default_rng(2))

@@ -144,6 +144,7 @@ def test_a_coil_far_behind_the_thermometer_is_named_with_its_delay(curved: bool)
     assert (effect.late, effect.remembers) == ("coil", True)
 
 
+@pytest.mark.long
 def test_a_late_coil_beside_stated_noise_leaves_no_noise_lacking():
     """Its part that the slope at no delay does not hold looks like a random walk, which is found first."""
     campaign = with_late_coil(np.random.default_rng(EXAMPLE), 350.0, curved=True)
@@ -236,8 +237,15 @@ def test_a_coil_follows_the_thermometer_through_its_lags(lags: tuple[float, ...]
     )
 
 
-@pytest.mark.parametrize("effect", ["bias_temperature_rate", "bias_temperature_product"])
-@pytest.mark.parametrize("steps", [pytest.param(8.0, marks=pytest.mark.long), 24.0])
+@pytest.mark.parametrize(
+    ("effect", "steps"),
+    [
+        ("bias_temperature_rate", 24.0),
+        pytest.param("bias_temperature_rate", 8.0, marks=pytest.mark.long),
+        pytest.param("bias_temperature_product", 24.0, marks=pytest.mark.long),
+        pytest.param("bias_temperature_product", 8.0, marks=pytest.mark.long),
+    ],
+)
 def test_a_coil_late_by_many_samples_has_no_other_name(effect: str, steps: float, monkeypatch: pytest.MonkeyPatch):
     """A strong Shupe effect of a coil that heat diffuses into: what its lag leaves must not be named as well."""
     monkeypatch.setitem(SHAPES, effect, lambda design, rng: {"tau": steps * design.step})

@@ -162,6 +162,7 @@ def test_less_noise_than_stated_lacks_nothing_and_more_markov_noise_is_told():
         assert "noise_markov" in gm.diagnose(log(more), markov, hold_out=False).credible_set
 
 
+@pytest.mark.long
 def test_kinds_of_noise_that_are_not_stated_are_causes():
     """Examples of a fixed seed: stated as white, and to be estimated, where only hops are no noise that a fit holds."""
     rng = np.random.default_rng(4)

@@ -100,6 +100,7 @@ def test_a_campaign_without_the_column_is_refused(rng: np.random.Generator):
         gm.fit(measured, model)
 
 
+@pytest.mark.long
 @pytest.mark.law
 def test_the_extended_model_states_what_was_found_and_is_adequate(tmp_path: Path, rng: np.random.Generator):
     first = gm.diagnose(campaign(rng, 4.0), gm.model_from_effects(["bias", "scale_factor"]), hold_out=False)

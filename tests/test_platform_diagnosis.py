@@ -83,9 +83,8 @@ def test_another_loop_is_named_where_the_friction_is_known(seed: int):
     assert compliance == pytest.approx(1.05 / (0.6 * 1.118) - 1, abs=5 * std + 0.03)
 
 
-@pytest.mark.parametrize(
-    "known", [pytest.param(False, marks=pytest.mark.long), True], ids=["no friction", "known friction"]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("known", [False, True], ids=["no friction", "known friction"])
 def test_nothing_hidden_is_adequate(known: bool):
     """Without friction, or with the simulation's own; of fresh seeds the benchmark tells."""
     log = vibration("loop_dynamics" if known else "", 0.0, seed=1)
@@ -189,7 +188,8 @@ def test_readings_of_gimbals_that_hardly_move_hold_no_error(axis: str):
     assert (diagnosis.verdict, diagnosis.causes) == ("adequate", ())
 
 
-@pytest.mark.parametrize("axis", ["X", pytest.param("Z", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("axis", "XZ")
 def test_a_delay_and_friction_about_one_axis(axis: str, seed: int):
     """A corner far above all frequencies made a delay of friction, of more than a loop holds."""
     log = late_and_rubbing(2 * MS, 0.5, seed)

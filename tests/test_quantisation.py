@@ -265,6 +265,7 @@ def test_two_levels_do_not_end_a_search():
     assert found.verdict in ("named", "ambiguous")
 
 
+@pytest.mark.long
 def test_lines_of_a_rounded_angle_are_not_a_periodic_bias():
     """2.6 counts a sample: the rates alternate between two values at a pace of their own."""
     rng = np.random.default_rng(3)
@@ -380,7 +381,7 @@ def test_exact_outputs_of_even_rates_are_no_steps():
 @pytest.mark.parametrize(
     ("hidden", "scale"),
     [
-        ("", 1.001),
+        pytest.param("", 1.001, marks=pytest.mark.long),
         pytest.param("bias_temperature", 1234.5, marks=pytest.mark.long),
         ("scale_nonlinearity", 1.001),
         ("bias_periodic", 1234.5),

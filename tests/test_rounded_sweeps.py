@@ -34,6 +34,7 @@ def test_lines_of_rounding_are_not_named_a_periodic_bias(rng: np.random.Generato
         assert "quantisation" in found.credible_set
 
 
+@pytest.mark.long
 def test_a_line_larger_than_rounding_makes_is_named(rng: np.random.Generator):
     line = 0.05 * np.sin(2.0 * np.pi * 0.17 * np.arange(ROWS) + rng.uniform(0, 2 * np.pi))
     found = sweep(rng, line=line, step=0.01)

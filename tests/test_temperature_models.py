@@ -78,7 +78,7 @@ def test_intervals_of_breakpoints_cover(rng: np.random.Generator):
 
 def test_a_sharp_bend_has_a_narrow_interval_that_covers(rng: np.random.Generator):
     """Narrower than the soaks are apart by hundreds: an interval must not end with the grid that finds it."""
-    count, inside, widths = 100, 0, []
+    count, inside, widths = 40, 0, []
     for _ in range(count):
         y = 1.0 + 0.01 * SOAKS - 0.02 * np.maximum(SOAKS - 3.7, 0.0) + 1e-3 * rng.standard_normal(11)
         model = fit_temperature_model({"SF": y}, SOAKS, "hinge")

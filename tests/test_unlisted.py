@@ -36,7 +36,7 @@ def leaked(values: np.ndarray, step: float, time_constant: float) -> np.ndarray:
     return inside
 
 
-@pytest.mark.parametrize("leak", [300.0, pytest.param(500.0, marks=pytest.mark.long), 1500.0])
+@pytest.mark.parametrize("leak", [1500.0, *(pytest.param(leak, marks=pytest.mark.long) for leak in (300.0, 500.0))])
 def test_what_follows_a_column_through_a_lag_is_told_of_that_column(leak: float, rng: np.random.Generator):
     """An altitude chamber's steps, felt through a leak of the housing, which a random walk would imitate."""
     fine = np.arange(0.0, TIME[-1] + 1.0)

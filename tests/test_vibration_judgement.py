@@ -35,16 +35,17 @@ README = Path(__file__).resolve().parents[1] / "README.md"
 LATE, SECOND = 2e-3, np.deg2rad(1 / 3600)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "kept",
     [
         # Six runs about axes without fault.
         [1, 2, 3, 9, 10, 11],
-        pytest.param([5, 6, 7, 8, 10, 11], marks=pytest.mark.long),
-        pytest.param([1, 2, 3, 4, 5, 6, 7, 8], marks=pytest.mark.long),
-        pytest.param([1, 4, 5, 8, 9, 12], marks=pytest.mark.long),
-        pytest.param([3, 4, 7, 8], marks=pytest.mark.long),
-        pytest.param([5, 6, 7, 8, 9, 10, 11, 12], marks=pytest.mark.long),
+        [5, 6, 7, 8, 10, 11],
+        [1, 2, 3, 4, 5, 6, 7, 8],
+        [1, 4, 5, 8, 9, 12],
+        [3, 4, 7, 8],
+        [5, 6, 7, 8, 9, 10, 11, 12],
     ],
 )
 def test_parts_of_a_log_are_not_firm_and_wrong(kept: list[int]):
