@@ -24,7 +24,7 @@ SIZES = (0.5, 1.0, 2.0, 3.0, 10.0)
 # Channels that a campaign measures, of those that unknown effects follow.
 MEASURED = ("temperature", "rate", "supply_voltage", "pressure")
 WALK = "noise_random_walk"
-# Row 18: processor seconds that must do, and that are wished for.
+# Row 18: processor seconds that must do, and seconds that are wished for.
 MUST_SECONDS, GOAL_SECONDS = 60.0, 10.0
 TIMED_DRAWS = 2000  # of the calibration of a diagnosis that is timed
 HEAD = [
@@ -349,16 +349,22 @@ def _mutants(parts: dict[str, list[study.Record]]) -> tuple[list[str], list[str]
     return lines, checks
 
 
-def _spent(seconds: Sequence[tuple[str, int, float, float]], by: str) -> str:
+def _spent(seconds: Sequence[tuple[str, int, float, float, float, float]], by: str) -> str:
     """Row 18 of what was timed, by an engine."""
-    each = ", ".join(f"{name} ({rows} rows) {one:.0f} and {two:.0f}" for name, rows, one, two in seconds)
-    first, then = (max(row[i] for row in seconds) for i in (2, 3))
-    measure = f"processor seconds with {TIMED_DRAWS} draws and hold-out, the first time and compiled before: {each}"
-    measure += f" (by {by})" if by else ""
-    must, goal = ("met" if first <= MUST_SECONDS else "**missed**"), ("met" if then <= GOAL_SECONDS else "missed")
+    each = ", ".join(
+        f"{name} ({rows} rows) {one:.0f} ({clock:.0f}) and {two:.0f} ({again:.0f})"
+        for name, rows, one, two, clock, again in seconds
+    )
+    first, then, _, clock = (max(row[i] for row in seconds) for i in (2, 3, 4, 5))
+    measure = (
+        f"processor seconds (and by the clock) with {TIMED_DRAWS} draws and hold-out, the first time and compiled "
+    )
+    measure += f"before: {each}{f' (by {by})' if by else ''}"
+    must = "met" if first <= MUST_SECONDS else "**missed**"
+    goal, by_clock = ("met" if seconds <= GOAL_SECONDS else "missed" for seconds in (then, clock))
     return (
-        f"| 18 | {measure} | 6 s | ≤ {MUST_SECONDS:g} s | {first:.0f} s, then {then:.0f} s | {len(seconds)} | {must} | "
-        f"{GOAL_SECONDS:g} s, compiled before: {goal} |"
+        f"| 18 | {measure} | 6 s | ≤ {MUST_SECONDS:g} s | {first:.0f} s, then {then:.0f} ({clock:.0f}) s | "
+        f"{len(seconds)} | {must} | {GOAL_SECONDS:g} s, compiled before: {goal}, by the clock {by_clock} |"
     )
 
 

@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # What of the package diagnoses a campaign of a gyro: a study goes on where none of this has changed.
 ENGINE = (
     "_noise_level.py", "_output_rate.py", "averages.py", "campaign.py", "diagnosis", "effects", "estimate", "model.py",
-    "noise", "numerics", "poses.py", "signals.py", "units.py",
+    "_model_units.py", "noise", "numerics", "poses.py", "signals.py", "units.py",
 )  # fmt: skip
 
 
@@ -44,7 +44,8 @@ class Kept:
         stored = json.loads(gzip.decompress(path.read_bytes())) if path.exists() else {}
         self.code: str = stored.get("code", "")
         self.scale: float = stored.get("scale", 0.0)
-        self.seconds: list[tuple[str, int, float, float]] = [tuple(row) for row in stored.get("seconds", [])]
+        # Of a first process and one that it spares: by the processor, then by the clock.
+        self.seconds: list[tuple[str, int, float, float, float, float]] = [tuple(r) for r in stored.get("seconds", [])]
         self.timed: str = stored.get("timed", "")
         self.oracle = {label: [Told(**t) for t in told] for label, told in stored.get("oracle", {}).items()}
         self.again: tuple[str, int, int] | None = tuple(stored["again"]) if stored.get("again") else None

@@ -112,9 +112,10 @@ def main() -> None:
         f"together about x, y, z; *squareness* what {pairs} lack of a right angle; arcsec with standard uncertainties, "
         "and the chance that noise alone does as much (3 degrees of freedom; below 1e-3 it is told). Each axis has a "
         "bias, a scale factor and leans towards both others. Where the unit turns about some direction at a tenth or "
-        "less of its fastest rate, neither is told, and beside a session that turns about all three it does not count. "
+        "less of its fastest rate, neither is told, and beside a session that turns about all three it has leans of "
+        "its own, which do not count. "
         "*Mounting added*: the reference turned by this much about x, y and z each, which takes "
-        "as much from the rotation and leaves the squareness, but for the second order. "
+        "about as much from the rotation and leaves the squareness. "
         "The last row of a session has the same angles from another fit, through the integrator to where windows end "
         f"(`attitude_real`), leans and mounting within {ALIKE['lean']:g} rad alike.",
         "",
@@ -128,7 +129,10 @@ def main() -> None:
         lines += [*table(head, [*by_rates(campaigns[-1:]), by_integrator(label)]), ""]
         with tempfile.TemporaryDirectory() as folder:
             verdicts.append([label, *commanded(path, Path(folder, "results"))])
-    lines += [f"Both sessions as those of one unit, where {LABELS[1]} does not count beside {LABELS[0]}:", ""]
+    lines += [
+        f"Both sessions as those of one unit, where leans of {LABELS[1]} do not count beside those of {LABELS[0]}:",
+        "",
+    ]
     lines += [*table(head, by_rates(campaigns)), ""]
     said = "`gyromodel diagnose` without `--axis`, from bias and scale factor, verdicts with ln B:"
     lines += [said, "", *table(["session", "x", "y", "z", "the axes together", "s"], verdicts)]

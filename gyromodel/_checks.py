@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable
+from contextlib import suppress
 from functools import lru_cache
 from typing import Any
 
@@ -70,6 +71,9 @@ def check_unit(name: str, unit: str | None) -> str:
     """
     if not _COLUMN_NAME.fullmatch(name) or len(name.encode()) > 200:
         rule = 'it must start with a letter or digit, have at most 200 bytes and none of [ ] , ; " / \\'
+        written = re.fullmatch(r"([^][]+?) *\[+([^][]*)\]+", name)
+        if written and len(name) <= 40 and _COLUMN_NAME.fullmatch(written[1]) and _is_unit(written[2]):
+            rule += f"; write '{written[1]} [{written[2]}]'"
         raise CampaignError(f"{shown(name)} cannot name a column: {rule}")
     if DERIVED.fullmatch(name):
         raise CampaignError(f"column '{name}' has the name of a signal that is derived from others: rename it")
@@ -85,6 +89,13 @@ def check_unit(name: str, unit: str | None) -> str:
     if known and not any(unit_system.convertible(unit, example) for example in known[1]):
         raise CampaignError(f"column '{name}' has unit [{unit}], expected {known[0]}, such as {listed(known[1])}")
     return unit
+
+
+def _is_unit(text: str) -> bool:
+    with suppress(unit_system.UnitError):
+        unit_system.tidy(text)
+        return True
+    return False
 
 
 def _known(name: str) -> tuple[str, list[str]] | None:

@@ -68,7 +68,14 @@ def diagnose_axes(
     unknown = [axis for axis, result in axes.items() if result["verdict"] == "unknown"]
     if unknown:
         said.append(f"How the axes lie together is not told: what axis {unknown[0]} lacks has no name.")
-    lie = None if unknown else triad(measured, extended)
+    lie = None
+    try:
+        lie = None if unknown else triad(measured, extended)
+    except (EstimateError, ModelError) as error:
+        said.append(
+            "How the axes lie together is not told: an axis cannot be fitted with leans beside what it lacks: "
+            + f"{str(error).rstrip('.')}."
+        )
     result = {"axes": axes, "not_diagnosed": not_diagnosed, "triad": lie and lie.to_dict()}
     write_text(output / "axes.json", json_text(result))
     return result, "\n".join([*said, *([lie.sentence()] if lie else [])]), (*written, "axes.json")

@@ -113,10 +113,10 @@ def fit(campaigns: Campaigns, model: ModelFile, output: Folder, axis: Axis = Non
     rows = [(row.effect, row.name, with_uncertainty(row.value, row.std, row.unit)) for row in estimate.table()]
     print_table(("effect", "parameter", "value ± standard uncertainty"), rows)
     shown = {float("inf"): "–"}
-    noise = [
-        (name, *(shown.get(n[k], f"{n[k]:.3g}") for k in ("value", "lo", "hi")), n["unit"])
-        for name, n in result["noise"].items()
-    ]
+    noise = []
+    for name, n in result["noise"].items():
+        value, *ends = (shown.get(n[k], f"{n[k]:.3g}") for k in ("value", "lo", "hi"))
+        noise.append((name, value, *(("stated", "") if estimate.noise_given else ends), n["unit"]))
     print()
     print_table(("noise", "value", "95 % from", "to", "unit"), noise)
     print_paths(output, "model.yaml", "fit.json")

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int
 from scipy import stats
 
 from gyromodel._checks import listed, thermometers
+from gyromodel._model_units import check_domain, check_units
 from gyromodel._noise_level import level_of
 from gyromodel._output_rate import rate_output
 from gyromodel.attitude import with_reference_rates
@@ -25,7 +26,7 @@ from gyromodel.campaign import Campaign
 from gyromodel.effects import Signals
 from gyromodel.effects.power_cycles import BiasTurnOn, cycles
 from gyromodel.estimate import Calibration, check_covariates, step_of, validity_unit
-from gyromodel.model import GyroModel, ModelError, check_domain, check_units
+from gyromodel.model import GyroModel, ModelError
 from gyromodel.signals import Record, read_signals
 from gyromodel.units import from_internal
 
@@ -232,7 +233,8 @@ def told(
         if of - numbers:
             others = listed(sorted(map(str, of - numbers)))
             notes.append(
-                f"{effect.label} was in campaign {others} of those that were fitted, and is not in these data."
+                f"{effect.label} was in campaign {others} of those that were fitted, and is not taken here: data of it "
+                "need a column 'campaign []' that holds its number."
             )
     if timed := [e.label for e in model.effects if "time" in e.columns_needed]:
         notes.append(f"Time in {', '.join(dict.fromkeys(timed))} counts from the start of this campaign.")

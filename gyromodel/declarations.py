@@ -14,8 +14,12 @@ from pathlib import Path
 from typing import Any
 
 # What the search derives of a column: its rate of change, and its value some time before. No column bears / or [.
-RATE_OF, EARLIER = "d({})/dt", "{}[earlier]"
-_DERIVED_OF = {RATE_OF: re.compile(r"d\((.+)\)/dt"), EARLIER: re.compile(r"(.+)\[earlier\]")}
+RATE_OF, EARLIER, BEHIND = "d({})/dt", "{}[earlier]", "{}[behind]"
+_DERIVED_OF = {
+    RATE_OF: re.compile(r"d\((.+)\)/dt"),
+    EARLIER: re.compile(r"(.+)\[earlier\]"),
+    BEHIND: re.compile(r"(.+)\[behind\]"),
+}
 FOLDER = Path(__file__).parent / "effects"
 
 
@@ -185,6 +189,6 @@ def column_of(label: str) -> str:
 
 
 def measured(column: str) -> tuple[str, str]:
-    """The measured column of a driver's, and what it is of it: RATE_OF, EARLIER, or empty where it is the same."""
+    """The measured column of a driver's, and what it is of it: one of `_DERIVED_OF`, or empty if the same."""
     found = ((m[1], form) for form, pattern in _DERIVED_OF.items() if (m := pattern.fullmatch(column)))
     return next(found, (column, ""))

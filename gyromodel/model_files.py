@@ -13,6 +13,7 @@ import yaml
 from gyromodel import __version__
 from gyromodel._atomic import write_text
 from gyromodel._checks import thermometers
+from gyromodel._model_units import parameter_unit
 from gyromodel._noise_entries import noise_entries, read_noise
 from gyromodel._yaml import Place, complaint, compose, exact_text
 from gyromodel.effects import Effect
@@ -21,7 +22,7 @@ from gyromodel.effects.drivers import BiasColumn
 from gyromodel.effects.scale import ScaleTemperatureCurve
 from gyromodel.effects.thermal import BiasTemperatureCurve
 from gyromodel.estimate import Calibration, Estimate, validity_unit
-from gyromodel.model import GyroModel, ModelError, make_effect, parameter_unit
+from gyromodel.model import GyroModel, ModelError, make_effect
 from gyromodel.numerics.uncertain import Source, Uncertain
 from gyromodel.signals import Record
 from gyromodel.units import convertible, from_internal, internal_unit

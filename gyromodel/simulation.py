@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from gyromodel._checks import CampaignError
+from gyromodel._model_units import check_reading, check_units
 from gyromodel._noise_level import with_stated_level
 from gyromodel.campaign import Campaign
 from gyromodel.effects.converter import Quantisation
-from gyromodel.model import GyroModel, ModelError, check_reading, check_units
+from gyromodel.model import GyroModel, ModelError
 from gyromodel.noise import TELEGRAPH_TIMES, NoiseRatios, check_stated, markov_sum, stated_ratios
 from gyromodel.numerics.state_space import build_filter, colour
 from gyromodel.signals import Record, read_signals

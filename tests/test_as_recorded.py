@@ -46,6 +46,36 @@ def test_a_drop_out_of_the_logger_restarts_no_warm_up(rng: np.random.Generator):
     assert np.asarray(read([cycled]).record.signals["time_on"])[100] == 0.0
 
 
+@pytest.mark.parametrize("amplitude", [8.0, pytest.param(0.0, marks=pytest.mark.long)])
+def test_a_warm_up_behind_every_gap_is_named_without_a_column_run(amplitude: float, rng: np.random.Generator):
+    """A minute of each of six turn-ons, 8 deg/h that decay in 15 s: lines had been named, which fail held out."""
+    on, turn = np.tile(np.arange(60.0), 6), np.repeat(np.arange(6), 60)
+    output = amplitude * np.exp(-on / 15.0) + rng.standard_normal(360)
+    time = on + np.cumsum(rng.uniform(1000.0, 7000.0, 6).round())[turn]
+    found = gm.diagnose(campaign(output).with_column("time", time, "s"), model_from_effects(["bias"]))
+    counted = any("warm-up behind every gap" in line for line in found.findings)
+    if not amplitude:
+        assert (found.verdict, counted) == ("adequate", False)
+        return
+    assert (found.verdict, [c.effect for c in found.causes], counted) == ("named", ["bias_warmup"], True)
+    size, tau = found.causes[0].parameters
+    assert size.value == pytest.approx(amplitude, abs=4 * size.std)
+    assert tau.value == pytest.approx(15.0, abs=4 * tau.std)
+    assert found.gain.ci95[0] > 1.5
+
+
+@pytest.mark.long
+def test_runs_with_biases_of_their_own_are_held_out_in_parts(rng: np.random.Generator):
+    """A run's own bias is not predicted by the others."""
+    on, run = np.tile(np.arange(60.0), 6), np.repeat(np.arange(1.0, 7.0), 60)
+    output = 8.0 * np.exp(-on / 15.0) + 3.0 * rng.standard_normal(6)[np.repeat(range(6), 60)] + rng.standard_normal(360)
+    measured = campaign(output, run=run).with_column("time", on + 4000.0 * run, "s")
+    found = gm.diagnose(measured, model_from_effects(["bias", "bias_turn_on"]))
+    assert [c.effect for c in found.causes] == ["bias_warmup"]
+    assert "fifths of stretches between gaps" in found.gain.scheme
+    assert found.gain.ci95[0] > 1.5
+
+
 def test_a_rate_that_stands_still_where_there_is_an_output_is_no_cause_of_noise(rng: np.random.Generator):
     """Slews with the output blank, rests between them."""
     slews = np.arange(300) % 60 >= 50
@@ -149,6 +179,7 @@ def test_effects_of_another_campaign_are_told_of(rng: np.random.Generator):
     alone = campaign(rng.standard_normal(60))
     note = compensate(alone, Calibration(model)).metadata["rate_estimated_note"]
     assert "bias_step was in campaign 2 of those that were fitted" in str(note)
+    assert "need a column 'campaign []' that holds its number" in str(note)
     numbered = alone.with_column("campaign", np.full(60, 2.0), "")
     assert "was in" not in str(compensate(numbered, Calibration(model)).metadata["rate_estimated_note"])
     step = compensate(numbered.with_column("output", np.linspace(0, 1, 60), "deg/h"), Calibration(model))

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from gyromodel._checks import CampaignError
+from gyromodel._model_units import check_units
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis import isolability
 from gyromodel.diagnosis._added_tests import added_tests
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.effects.geometry import cross_rates
-from gyromodel.model import GyroModel, check_units, model_from_effects
+from gyromodel.model import GyroModel, model_from_effects
 from gyromodel.signals import read_signals
 
 ROWS, STEP = 200, 20.0

@@ -328,6 +328,7 @@ def test_a_fitted_model_is_an_input_of_every_command(bench: Path, run: Run):
     assert run("simulate", fitted, "--like", campaign, "-o", bench / "again.csv").status == 0
     refit = run("fit", bench / "again.csv", "--model", fitted, "-o", bench / "refit")
     assert refit.status == 0, refit.err
+    assert re.search(r"^noise_white +\S+ +stated  ", refit.out, re.MULTILINE)
 
 
 @pytest.fixture

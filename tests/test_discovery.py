@@ -25,10 +25,10 @@ from tests.truth.study import SLOW
 from tests.truth.verdicts import ACCEPTED, Answer, judge
 
 # Engine calls, each some seconds.
-NULLS, MOVING, STRANGE = 40, 10, 10  # in noise of the family, the same on the move, in other noise anywhere
+NULLS, MOVING, STRANGE = 24, 6, 6  # in noise of the family, the same on the move, in other noise anywhere
 NAMES = len({e for d in HOMES for e in TESTABLE[d]})
-EFFECTS_1, EFFECTS_3, EFFECTS_10 = 20, 60, 20  # other effects each run
-UNKNOWN_3, UNKNOWN_10 = 16, 8  # of 8 uncatalogued effects
+EFFECTS_1, EFFECTS_3, EFFECTS_10 = 12, 36, 10  # other effects each run
+UNKNOWN_3, UNKNOWN_10 = 12, 6  # of 8 uncatalogued effects
 RETRIES = 5  # further draws of an effect that was missed once
 WORKERS = 1 if "PYTEST_XDIST_WORKER" in os.environ else 2
 
@@ -139,7 +139,12 @@ def test_what_a_study_keeps_on_disk_comes_to_the_same_levels(tmp_path):
                     (1.5, 1.2, 1.9), (3.0, 1.0, 5.0))  # fmt: skip
     records = [replace(r, answer=answer, score=judge(r.truth, r.case.design, answer)) for r in records]
     kept = Kept(tmp_path / "seed_5.json.gz")
-    kept.code, kept.scale, kept.seconds, kept.parts = "tree", 0.25, [("tumble", 936, 20.5)], {"some": records}
+    kept.code, kept.scale, kept.seconds, kept.parts = (
+        "tree",
+        0.25,
+        [("tumble", 936, 20.5, 15.0, 16.0, 11.0)],
+        {"some": records},
+    )
     kept.save()
     again = Kept(kept.path)
     assert (again.code, again.scale, again.seconds) == (kept.code, kept.scale, kept.seconds)

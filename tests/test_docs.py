@@ -47,10 +47,11 @@ def test_every_python_block_of_the_readme_runs(tmp_path: Path):
     command = [sys.executable, "-W", "error", "blocks.py"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    printed = done.stdout.splitlines()
-    assert printed[1].startswith("named ['bias_temperature_rate'] ")
-    assert f"# {printed[2]}\n" in README
-    assert f"# {', '.join(printed[3:])}\n" in README
+    bias, temperature, found, supply, *values = done.stdout.splitlines()
+    assert bias.startswith("bias  ") and temperature.startswith("bias_temperature  ")
+    assert found.startswith("named ['bias_temperature_rate'] ")
+    assert f"# {supply}\n" in README
+    assert f"# {', '.join(values)}\n" in README
 
 
 @pytest.mark.long

@@ -449,6 +449,7 @@ def test_nothing_to_fit_still_gives_the_noise(rng: np.random.Generator):
     assert estimate.covariance.shape == (0, 0)
     assert estimate.degrees_of_freedom == ROWS
     assert estimate.table()[0].std == 0.0
+    assert "(fixed)" in str(estimate.table()).splitlines()[0]
     assert set(estimate.noise_interval) == set(estimate.model.noise) > {"noise_white"}
 
 

@@ -147,3 +147,20 @@ def test_the_true_gain_of_the_study_is_that_of_least_squares_on_average(effect: 
                 fitted = np.linalg.lstsq(columns[others], output[others], rcond=1e-9)[0]
                 squares[i] += np.mean((output[rows] - columns[rows] @ fitted) ** 2)
     assert np.sqrt(squares[0] / squares[1]) == pytest.approx(true_gain(case), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("after", "cut"),
+    [
+        ([(3.0, 50.0)], True),
+        ([(3.0, 50.0), (2.0, 60.0)], True),
+        ([(3.0, 50.0), (0.5, 150.0)], False),
+        ([(0.5, 150.0), (2.0, 60.0)], False),
+        ([(3.0, 120.0)], False),
+        ([(3.0, 50.0), (np.nan, -np.inf)], True),
+        ([(np.nan, -np.inf), (3.0, 50.0)], False),
+    ],
+)
+def test_rounds_are_cut_where_the_error_left_out_rises_for_good(after: list[tuple[float, float]], cut: bool) -> None:
+    """Held-out errors and log scores of rounds after one with 1 and 100."""
+    assert _session.rises_for_good((1.0, 100.0), *after) == cut

@@ -122,6 +122,16 @@ def test_a_parameter_fixed_at_a_wrong_value_is_named(rng: np.random.Generator) -
     assert any("bias is fixed in the simulation" in line for line in found.findings)
 
 
+def test_a_wrong_constant_and_a_line_are_no_curve(rng: np.random.Generator) -> None:
+    """A hinge at the cold end, which is a line and a constant, explains both in one."""
+    temperature = 20 + 20 * np.sin(TIME / 240)
+    log = campaign(5 + 0.1 * temperature + rng.normal(size=ROWS), temperature=temperature)
+    found = gm.diagnose(log, fixed("bias", "value", 5 * np.deg2rad(1 / 3600)), hold_out=False)
+    assert {"bias", "bias_temperature"} <= set(found.extended.model.labels)
+    assert "bias_temperature" in [c.effect for c in found.causes]
+    assert found.verdict == "ambiguous" or "bias_temperature_curve" not in [c.effect for c in found.causes]
+
+
 def test_noise_stated_too_large_lacks_nothing(rng: np.random.Generator) -> None:
     unit = np.deg2rad(1 / 3600)
     noise = {"noise_white": unit * np.sqrt(10.0), "noise_random_walk": unit}
@@ -361,12 +371,31 @@ def test_anomalous_dwells_measured_once_are_points_or_a_curve(bad: int, shift: f
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("bad", "shift"), [(2, 20.0), (4, 6.0)])
-def test_anomalous_dwells_are_given_up_where_other_visits_are_good(bad: int, shift: float) -> None:
+@pytest.mark.parametrize(("bad", "shift"), [(1, 8.0), (2, 20.0), (4, 6.0)])
+def test_anomalous_dwells_are_named_where_other_visits_are_good(bad: int, shift: float) -> None:
     drawn = rate_table(np.random.default_rng(bad), bad, shift, visits=4)
     found = gm.diagnose(drawn, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
-    assert found.verdict == "adequate"
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["outliers"])
+    assert len(found.causes[0].parameters) == bad
+    if bad == 1:
+        assert any(line.startswith("A whole dwell, which begins") for line in found.findings)
+        return
     assert any(line.startswith(f"{bad} whole dwells, which begin") for line in found.findings)
+
+
+@pytest.mark.long
+def test_an_anomalous_dwell_hides_no_drift() -> None:
+    """Of hundreds of nats, beside a drift that a walk may be: what cannot be told apart decides the verdict."""
+    drawn = rate_table(np.random.default_rng(5), 1, 20.0, visits=4)
+    drift = 2.0 * (np.arange(len(drawn.columns["time"])) / len(drawn.columns["time"])) / 3600
+    found = gm.diagnose(
+        drawn.with_column("output", drawn.columns["output"] + drift, "deg/s"),
+        gm.model_from_effects(["scale_factor", "bias"]),
+        hold_out=False,
+    )
+    assert found.verdict == "ambiguous"
+    assert "bias_drift" in found.credible_set
+    assert "outliers" in {c.effect for c in found.causes}
 
 
 @pytest.mark.long

@@ -101,10 +101,14 @@ def test_two_errors_side_by_side_are_no_band(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize(("size", "of_noise"), [(0.0, True), (2.0, False)])
 def test_a_line_is_held_against_the_band_about_it(size: float, of_noise: bool, rng: np.random.Generator) -> None:
-    """In noise that turns its sign from sample to sample, the greatest of its own lines, and one far above these."""
-    white = NoiseRatios(jnp.zeros(()), jnp.zeros(()))
-    output = lfilter([0.8], [1.0, 0.6], rng.standard_normal(ROWS)) + size * np.cos(2 * np.pi * 0.45 * TIME)
-    greatest = 400 + np.argmax(np.abs(np.fft.rfft(output))[400 : ROWS // 2])
-    line = BiasPeriodic(cosine=np.zeros(1), sine=np.zeros(1), frequency=np.array([greatest / ROWS]))
-    fitted = fit_record(read_signals(log(output)), GyroModel((Bias(), line), {}), ratios=white)
-    assert lines_of_noise(fitted) == [of_noise]
+    """In noise that turns its sign from sample to sample, the greatest of its own lines, and one far above these.
+
+    The greatest of one in twenty draws stands out by itself.
+    """
+    white, told = NoiseRatios(jnp.zeros(()), jnp.zeros(())), list[bool]()
+    for _ in range(5):
+        output = lfilter([0.8], [1.0, 0.6], rng.standard_normal(ROWS)) + size * np.cos(2 * np.pi * 0.45 * TIME)
+        greatest = 400 + np.argmax(np.abs(np.fft.rfft(output))[400 : ROWS // 2])
+        line = BiasPeriodic(cosine=np.zeros(1), sine=np.zeros(1), frequency=np.array([greatest / ROWS]))
+        told += lines_of_noise(fit_record(read_signals(log(output)), GyroModel((Bias(), line), {}), ratios=white))
+    assert told.count(of_noise) >= (4 if of_noise else 5)

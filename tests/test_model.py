@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, norm
 
+from gyromodel._model_units import check_units, parameter_unit
 from gyromodel.campaign import Campaign
 from gyromodel.effects.drivers import Bias, BiasColumn, BiasDrift, BiasStep
 from gyromodel.effects.scale import ScaleAsymmetry, ScaleFactor, ScaleTemperature
@@ -20,11 +21,9 @@ from gyromodel.estimate import fit_record
 from gyromodel.model import (
     GyroModel,
     ModelError,
-    check_units,
     effect_class,
     make_effect,
     model_from_effects,
-    parameter_unit,
 )
 from gyromodel.signals import Record, read_signals
 from gyromodel.simulation import draw_noise, simulate

@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 
 import gyromodel as gm
 from gyromodel._noise_level import relative_variance, with_level
 from gyromodel.compensation import compensate
-from gyromodel.estimate import fit_many
+from gyromodel.diagnosis._variance import growing_noise
+from gyromodel.estimate import fit_many, fit_record
 from gyromodel.model import Level, ModelError
 from gyromodel.signals import read_signals
 
@@ -123,8 +125,28 @@ def test_more_than_is_stated_beside_a_walk_that_is_not_is_stated_with_it(rng: np
     found = gm.diagnose(measured, stated(2.0), hold_out=False)
     assert "noise_heteroscedastic" in {c.effect for c in found.causes}
     assert found.extended.model.level is not None
-    assert found.extended.model.level.ratio == pytest.approx(8.0, rel=0.5)
+    assert found.extended.model.level.ratio == pytest.approx(8.0, rel=0.4)
     assert found.noise["noise_heteroscedastic"]["value"] == found.extended.model.level.ratio
+
+
+@pytest.mark.long
+@pytest.mark.law
+def test_a_level_found_beside_a_walk_holds_what_was_drawn(rng: np.random.Generator):
+    model, draws = replace(stated(1.0), noise={}, level=None), 60
+    # |rate| of twenty rates goes from 5.3 to 100 deg/s.
+    low = np.abs(rates()).min() / np.deg2rad(100.0)
+    expected, off, stds = (1.0 - low) * np.log(8.0), [], []
+    for _ in range(draws):
+        walk = np.cumsum(rng.standard_normal(ROWS)) * 0.2 * N / np.sqrt(STEP)
+        measured = campaign(rng, 8.0)
+        record = read_signals([measured.with_column("output", measured.columns["output"] + walk, "rad/s")])
+        grows = growing_noise(record, fit_record(record, model))
+        assert grows is not None
+        stds.append(grows.ratio_std / grows.ratio)
+        off.append((np.log(grows.ratio) - expected) / stds[-1])
+    held = int(np.sum(np.abs(off) < 1.96))
+    assert held >= binom.ppf(1e-4, draws, 0.9), f"{held} of {draws}"
+    assert np.median(stds) < 0.2
 
 
 def test_a_level_in_a_part_of_a_range_is_joined_to_that_of_the_whole(rng: np.random.Generator):

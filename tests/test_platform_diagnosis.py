@@ -83,8 +83,9 @@ def test_another_loop_is_named_where_the_friction_is_known(seed: int):
     assert compliance == pytest.approx(1.05 / (0.6 * 1.118) - 1, abs=5 * std + 0.03)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("known", [False, True], ids=["no friction", "known friction"])
+@pytest.mark.parametrize(
+    "known", [pytest.param(False, marks=pytest.mark.long), True], ids=["no friction", "known friction"]
+)
 def test_nothing_hidden_is_adequate(known: bool):
     """Without friction, or with the simulation's own; of fresh seeds the benchmark tells."""
     log = vibration("loop_dynamics" if known else "", 0.0, seed=1)

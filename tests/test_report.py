@@ -29,7 +29,7 @@ from gyromodel.declarations import declarations
 from gyromodel.diagnosis._data import read as search_data
 from gyromodel.diagnosis._result import Candidate, Cause, Confuser, Diagnosis, Driver, Gain, ParameterValue, Round
 from gyromodel.estimate import Estimate
-from gyromodel.estimate._estimate import ParameterRow
+from gyromodel.estimate._calibration import ParameterRow
 from gyromodel.report import history_figure, sentence, with_uncertainty, write_report
 from gyromodel.report._figures import _column, figures
 from gyromodel.report._numbers import number, pair, percent, stated, unit_text
@@ -160,8 +160,8 @@ def made(campaign: Campaign, error: np.ndarray, noise: float, rng: np.random.Gen
         "noise_kinds": {"noise_white": 0.71, "noise_white + noise_random_walk": 0.27},
         "evidence": {"bias_temperature_rate": (203.1, 205.0, 204.2, 203.2), "bias_drift": (-1.0, -2.1, -3.2, -4.4)},
         "rounds": (
-            Round("bias_temperature_rate", 212.4, ranking, spread[1], 180.2),
-            Round(None, 0.4, rest, spread[1], 180.2),
+            Round(None, 0.0, ranking, spread[0], 0.0),
+            Round("bias_temperature_rate", 212.4, rest, spread[1], 180.2),
         ),
         "credible_set": {"bias_temperature_rate": 0.9996},
         "unexplained": {"temperature": 0.004, "time": 0.021},
@@ -188,7 +188,7 @@ def unchanged(diagnosis: Diagnosis) -> dict[str, Any]:
         log_score_ci95=(0.0, 0.0),
     )
     return {
-        "causes": (), "gain": gain, "rounds": diagnosis.rounds[1:], "credible_set": {},
+        "causes": (), "gain": gain, "rounds": (replace(diagnosis.rounds[1], added=None),), "credible_set": {},
         "residual_before": after, "residual_after": after, "predicted_before": predicted, "predicted_after": predicted,
         "extended": diagnosis.baseline,
     }  # fmt: skip
@@ -239,7 +239,9 @@ def ambiguous(rng: np.random.Generator, points: int = 18_000) -> Diagnosis:
     return replace(
         base, verdict="ambiguous", causes=(drift, walk), gain=gain,
         credible_set={"bias_drift": 0.52, "noise_random_walk": 0.44},
-        rounds=(Round("bias_drift", 9.1, ranking, 2.01e-4, 6.0), base.rounds[1]),
+        rounds=(
+            replace(base.rounds[0], ranking=ranking), replace(base.rounds[1], added="bias_drift", statistic=9.1),
+        ),
         next_test="Repeat the run: a drift returns with the same slope, a random walk does not.",
     )  # fmt: skip
 
@@ -254,12 +256,11 @@ def unknown(rng: np.random.Generator, points: int = 430) -> Diagnosis:
     base = made(campaign, shape(heat), 1.1e-4, rng)
     step = replace(
         base.rounds[0],
-        added="smooth(temperature)",
         ranking=(Candidate("smooth(temperature)", 88.0, 0.999, "driver"), *base.rounds[0].ranking[3:]),
     )
     return replace(
         base, verdict="unknown", causes=(), driver=driver, credible_set={"smooth(temperature)": 0.999},
-        rounds=(step, base.rounds[1]), next_test="Hold the temperature at 48 °C, then at 52 °C, for an hour each.",
+        rounds=(step,), next_test="Hold the temperature at 48 °C, then at 52 °C, for an hour each.",
     )  # fmt: skip
 
 
@@ -368,9 +369,10 @@ def test_a_gain_within_its_scatter_is_not_called_a_fall():
     diagnosis = named(np.random.default_rng(1))
     gain = replace(diagnosis.gain, ci95=(0.97, 1.2), log_score_ci95=(-1.0, 3.0))
     assert "within its own scatter" in sentence(replace(diagnosis, gain=gain))
-    assert "hardly moves" in sentence(replace(diagnosis, gain=replace(gain, log_score_ci95=(1.0, 3.0))))
+    predicted = sentence(replace(diagnosis, gain=replace(gain, log_score_ci95=(1.0, 3.0))))
+    assert "within its own scatter, but the spread of those data is clearly better predicted" in predicted
     assert "rises" in sentence(replace(diagnosis, gain=replace(gain, ci95=(0.8, 0.9))))
-    assert "too short" in sentence(replace(diagnosis, gain=replace(gain, after=math.nan)))
+    assert "no two blocks can be left out" in sentence(replace(diagnosis, gain=replace(gain, after=math.nan)))
 
 
 def test_each_verdict_has_its_sentence(rng: np.random.Generator):
@@ -520,6 +522,42 @@ def test_an_unknown_shows_the_function_it_follows(rng: np.random.Generator, tmp_
     assert "follows temperature some time before" in "".join(read(tmp_path / "report.html").text)
 
 
+def test_every_ranking_is_of_what_could_be_added_next(rng: np.random.Generator):
+    first, second = context(named(rng))["rankings"]
+    assert first["title"] == "Round 1: ranked beside your simulation"
+    assert [row["id"] for row in first["rows"] if row["chosen"]] == ["bias_temperature_rate"]
+    assert second["title"] == "Round 2: ranked with a temperature-rate bias added"
+    assert second["rows"][0]["statistic"] == "-1.0"
+    assert not any(row["chosen"] for row in second["rows"])
+
+
+def test_noise_kinds_and_the_fitted_terms_do_not_contradict_one_another(rng: np.random.Generator):
+    """Markov noise is the fit's where it is likeliest, and a kind's name only where that outweighs its rarity."""
+    kinds = {"noise_white + noise_flicker": 0.67, "noise_white + noise_markov": 0.29}
+    white, markov = ({"value": 0.01, "lo": 0.01, "hi": 0.02, "unit": "deg/sqrt(h)"} for _ in range(2))
+    diagnosis = replace(named(rng), noise_kinds=kinds, noise={"noise_white": white, "noise_markov": markov})
+    assert context(diagnosis)["noise_kinds"].endswith("(29 %).")
+    flicker = replace(diagnosis, noise_kinds={"noise_white + noise_flicker": 0.96, "noise_white + noise_markov": 0.04})
+    assert "in which Markov noise was likeliest" in context(flicker)["noise_kinds"]
+    other = replace(diagnosis, noise_kinds={"noise_white + noise_markov": 0.98}, noise={"noise_white": white})
+    assert "the fit, which holds no Markov noise" in context(other)["noise_kinds"]
+
+
+def test_stated_noise_has_no_interval(rng: np.random.Generator):
+    noise = {"noise_white": {"value": 0.01, "lo": 0.01, "hi": 0.01, "unit": "deg/sqrt(h)"}}
+    assert [row["interval"] for row in context(replace(named(rng), noise=noise))["noise"]] == ["stated"]
+
+
+def test_what_was_set_aside_is_not_said_to_be_no_extension(rng: np.random.Generator, tmp_path: Path):
+    base = outlying(rng)
+    gain = replace(base.gain, after=base.gain.before)
+    steps = (base.rounds[0], replace(base.rounds[1], added="outliers"))
+    text = "".join(read(write_report(replace(base, causes=base.causes[1:], gain=gain, rounds=steps), tmp_path)[0]).text)
+    assert "How the simulation was extended" in text
+    assert "Nothing was added that predicts data not used" in text
+    assert "was not extended" not in text
+
+
 def test_points_that_stand_apart_are_ringed_with_their_rate(rng: np.random.Generator, tmp_path: Path):
     diagnosis = outlying(rng)
     report = write_report(diagnosis, tmp_path)[0]
@@ -553,7 +591,7 @@ def test_a_report_without_models_gain_or_rounds_is_written(rng: np.random.Genera
         "findings": (),
     }
     text = "".join(read(write_report(replace(diagnosis, **changes), tmp_path)[0]).text)
-    assert "too short" in text
+    assert "No two blocks of the campaign can be left out" in text
 
 
 def test_a_second_report_replaces_the_first_and_is_the_same(rng: np.random.Generator, tmp_path: Path):

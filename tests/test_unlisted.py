@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from scipy.stats import binom
@@ -74,6 +76,45 @@ def test_a_ripple_over_temperature_is_told_of_however_fine(periods: float, rng: 
     fringes = np.sin(2 * np.pi * periods * (inside - inside.min()) / np.ptp(inside) + rng.uniform(0.0, 6.0))
     measured = log(0.5 + 0.08 * fringes, rng, temperature=inside + 0.01 * rng.standard_normal(len(TIME)))
     assert followed(measured) == "temperature"
+
+
+@pytest.mark.parametrize(
+    "effect",
+    ["bias_step", *(pytest.param(e, marks=pytest.mark.long) for e in ("bias_temperature_rate", "bias_supply_voltage"))],
+)
+def test_names_stand_beside_what_has_none(effect: str, rng: np.random.Generator):
+    """Fringes of 40 standard deviations, and a name of 20 to 40 that they hide from a search without them."""
+    inside, epoch = chamber(rng), rng.uniform(0.3, 0.7) * TIME[-1]
+    fringes = 0.08 * np.sin(2 * np.pi * 4.3 * (inside - inside.min()) / np.ptp(inside) + rng.uniform(0.0, 6.0))
+    supply = leaked(rng.standard_normal(len(TIME)), STEP, 600.0)
+    supply = 28.0 + (supply - supply.mean()) / supply.std()
+    of = {"bias_step": epoch <= TIME, "bias_temperature_rate": np.gradient(inside, STEP), "bias_supply_voltage": supply}
+    size = {"bias_step": 0.12, "bias_temperature_rate": 4.0, "bias_supply_voltage": 0.06}[effect]
+    measured = log(0.5 + fringes + size * of[effect], rng, temperature=inside + 0.01 * rng.standard_normal(len(TIME)))
+    measured = measured.with_column("supply_voltage", supply, "V")
+    found = gm.diagnose(measured, gm.model_from_effects(["bias"]), hold_out=False)
+    assert (found.verdict, found.driver and found.driver.column) == ("unknown", "temperature")
+    assert [c.effect for c in found.causes] == [effect]
+    told = found.causes[0].parameters
+    assert abs(told[0].value - size) < 5.0 * told[0].std < 2.0 * size
+    if effect == "bias_step":
+        assert told[1].ci95
+        assert told[1].ci95[0] - 10.0 * STEP <= epoch <= told[1].ci95[1] + 10.0 * STEP
+        assert np.ptp(told[1].ci95) < 0.1 * TIME[-1]
+    # What follows another column may show before anything is said of the temperature.
+    beside = [r.beside for r in found.rounds]
+    assert beside == ["smooth(temperature)", None] or (effect == "bias_supply_voltage" and beside == [None, None])
+
+
+@pytest.mark.long
+def test_large_fringes_leave_no_name_of_their_own_column() -> None:
+    """Of 150 standard deviations, over a clean thermometer: the finest function searched leaves a part of a slope."""
+    rng = np.random.default_rng(0)
+    inside = chamber(rng)
+    fringes = 8.0 * np.sin(2 * np.pi * 4.3 * (inside - inside.min()) / np.ptp(inside) + rng.uniform(0.0, 6.0))
+    found = gm.diagnose(log(0.5 + fringes, rng, temperature=inside), gm.model_from_effects(["bias"]), hold_out=False)
+    assert (found.verdict, found.driver and found.driver.column) == ("unknown", "temperature")
+    assert not found.causes
 
 
 def ramps(number: float) -> np.ndarray:
@@ -155,6 +196,54 @@ def test_the_heat_of_a_torquer_follows_what_the_rate_was(rng: np.random.Generato
     warm = leaked((rate / 100.0) ** 2, STEP, rng.uniform(500.0, 1500.0))
     measured = log(3600.0 * rate + 0.5 + 0.9 * warm, rng, rate=rate, temperature=chamber(rng))
     assert followed(measured, "scale_factor") == "rate[earlier]"
+
+
+def visited(rng: np.random.Generator) -> np.ndarray:
+    """Rates of a table in random order, 24 of 50 samples each, in deg/s."""
+    return np.repeat(rng.permutation(np.repeat(np.linspace(-60.0, 60.0, 12), 2)), 50)
+
+
+@pytest.mark.parametrize("constant", [12.0, *(pytest.param(c, marks=pytest.mark.long) for c in (4.0, 30.0))])
+def test_what_recovers_after_each_step_of_the_rate_follows_what_the_rate_was(constant: float, rng: np.random.Generator):
+    """Of forty standard deviations, in proportion to the step: the time constant (in samples) is told."""
+    rate = visited(rng)
+    recovery = rate - leaked(rate, 1.0, constant)
+    output = 3600.0 * rate + 0.5 + 40.0 * 0.05 / np.linalg.norm(recovery) * recovery
+    measured = log(output, rng, rate=rate, temperature=25.0 + 0.01 * rng.standard_normal(len(TIME)))
+    found = gm.diagnose(measured, gm.model_from_effects(["bias", "scale_factor"]), hold_out=False)
+    assert (found.verdict, found.causes, found.driver and found.driver.column) == ("unknown", (), "rate[behind]")
+    [told] = [between for f in found.findings if (between := re.search(r"time constant of some (\S+) to (\S+) s", f))]
+    assert 0.95 * float(told[1]) < STEP * constant < 1.05 * float(told[2])
+    assert float(told[2]) < 2.1 * float(told[1])
+    assert "in steps between which it is not known" in found.not_testable["bandwidth"]
+
+
+@pytest.mark.parametrize("late", [0.0, 0.3])
+def test_a_table_in_steps_lacks_nothing_or_is_late_within_a_sample(late: float, rng: np.random.Generator):
+    """Of the first sample after each step alone, which had been given up as gross errors of an adequate model."""
+    rate = visited(rng)
+    first = np.diff(rate, prepend=rate[0])
+    measured = log(3600.0 * rate + 0.5 - late * first, rng, rate=rate)
+    found = gm.diagnose(measured, gm.model_from_effects(["bias", "scale_factor"]), hold_out=False)
+    if not late:
+        assert (found.verdict, found.causes, found.driver) == ("adequate", (), None)
+        return
+    assert (found.verdict, found.driver and found.driver.column) == ("unknown", "rate[behind]")
+    assert any("may be apart" in line for line in found.findings)
+
+
+def test_gross_errors_after_changes_of_the_rate_are_told_of(rng: np.random.Generator):
+    """A table that turns to each rate at a moment of its own: in proportion to nothing, and not in the reference."""
+    rate = visited(rng)
+    change, wrong = np.diff(rate, prepend=rate[0]), np.zeros(len(rate))
+    first = np.flatnonzero(change)
+    # Their signs alternate from the greatest fall of the rate to its greatest rise.
+    by_size = first[np.argsort(change[first])]
+    wrong[by_size] = rng.uniform(1.0, 2.0, len(first)) * np.where(np.arange(len(first)) % 2, 1.0, -1.0)
+    measured = log(3600.0 * rate + 0.5 + wrong, rng, rate=rate)
+    found = gm.diagnose(measured, gm.model_from_effects(["bias", "scale_factor"]), hold_out=False)
+    assert found.verdict == "adequate"
+    assert any("gross errors are the first sample after a change of the rate" in line for line in found.findings)
 
 
 @pytest.mark.long

@@ -12,30 +12,20 @@ from gyromodel.diagnosis._result import Candidate, Round
 from gyromodel.diagnosis._search import Selection
 from gyromodel.diagnosis._session import Session
 from gyromodel.diagnosis._steps import Found
-from gyromodel.estimate import Estimate
 
 
 def rounds_of(session: Session, selection: Selection, scale: float, hold_out: bool) -> tuple[Round, ...]:
-    """What each round of the search ranked and added, and the held-out error after it: NaN where none is asked for."""
-    steps: list[tuple[Found | None, Ranking, Estimate]] = [
-        (f, f.ranking, e) for f, e in zip(selection.path, selection.estimates[1:], strict=False)
-    ]
+    """The simulation as given, then each addition: all candidates ranked beside it, and the held-out error with it.
+
+    The error is NaN where none is asked for.
+    """
+    rankings = [*(f.ranking for f in selection.path), selection.last]
+    added = [(None, 0.0), *((f.name, f.ranking.statistic[f.name]) for f in selection.path)]
+    besides = [*(f.beside for f in selection.path), ""]
     rounds = []
-    unknown = (np.nan, np.nan, False)
-    before = session.ladder(selection.estimates[0]) if hold_out else unknown
-    rounds.append(
-        Round(
-            None,
-            0.0,
-            _ranking(selection.path[0].ranking if selection.path else selection.last),
-            before[0] * scale,
-            before[1],
-        )
-    )
-    for step, ranking, estimate in steps:
-        assert step is not None
-        rms, score, _ = session.ladder(estimate) if hold_out else unknown
-        rounds.append(Round(step.name, ranking.statistic[step.name], _ranking(ranking), rms * scale, score))
+    for (name, evidence), ranking, beside, estimate in zip(added, rankings, besides, selection.estimates, strict=True):
+        rms, score, _ = session.ladder(estimate) if hold_out else (np.nan, np.nan, False)
+        rounds.append(Round(name, evidence, _ranking(ranking), rms * scale, score, beside or None))
     return tuple(rounds)
 
 
@@ -44,17 +34,22 @@ def evidence_at_sizes(selection: Selection, alike: Mapping[str, float]) -> dict[
 
     Gross errors are a campaign's own.
     """
-    of = dict.fromkeys(selection.last.statistic, selection.last)
+    of = dict.fromkeys(selection.last.statistic, selection.last) | as_added(selection, alike)
+    return {name: ranking.at_sizes(name) for name, ranking in sorted(of.items()) if name != "outliers"}
+
+
+def as_added(selection: Selection, alike: Mapping[str, float]) -> dict[str, Ranking]:
+    """The ranking in which each name that was found was added, and what is alike with it."""
+    of: dict[str, Ranking] = {}
     for f in reversed(selection.found):
         rivals = alike if f.name in alike else ()
         of |= {name: f.ranking for name in (*rivals, f.name) if name in f.ranking.statistic}
-    return {name: ranking.at_sizes(name) for name, ranking in sorted(of.items()) if name != "outliers"}
+    return of
 
 
 def p_value_of(selection: Selection, nulls: np.ndarray) -> float:
     """Share of campaigns with nothing hidden whose best candidate has as much evidence; this one is counted."""
-    first = selection.path[0].ranking if selection.path else selection.last
-    return float((1 + np.sum(nulls >= first.significance)) / (1 + len(nulls)))
+    return float((1 + np.sum(nulls >= selection.first.significance)) / (1 + len(nulls)))
 
 
 def more_needed(first: Ranking, path: Sequence[Found]) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -42,6 +43,16 @@ class Batch:
         """What is said of some of many residuals, without the forms."""
         evidence = {name: values[which] for name, values in self.evidence.items()}
         return Batch(self.log_likelihood[which], self.rss[which], evidence, {}, self.energy, {})
+
+    @staticmethod
+    def joined(batches: Sequence[Batch]) -> Batch:
+        """Of further residuals beside the same baseline, without the forms."""
+        one = batches[0]
+        log, rss = (np.concatenate([getattr(b, name) for b in batches]) for name in ("log_likelihood", "rss"))
+        none = [np.full(len(b.rss), -np.inf) for b in batches]
+        names = dict.fromkeys(name for b in batches for name in b.evidence)
+        each = {n: [b.evidence.get(n, nothing) for b, nothing in zip(batches, none, strict=True)] for n in names}
+        return Batch(log, rss, {n: np.concatenate(parts) for n, parts in each.items()}, {}, one.energy, {})
 
     def first(self) -> CellResult:
         """The first residual's results as plain numbers."""

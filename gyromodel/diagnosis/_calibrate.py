@@ -27,8 +27,9 @@ from gyromodel.estimate import Estimate, filter_of
 from gyromodel.noise import from_grams, gram_by_cell
 from gyromodel.numerics.state_space import colour
 
-# Draws searched at once, more of short records, whose values stay within so many.
-LEAST_TOGETHER, MOST_TOGETHER, VALUES_TOGETHER = 64, 256, 2**18
+# Draws searched at once: what candidates share is worked out once for them. Fewer of long records, which have so many
+# values at most.
+LEAST_DRAWN, MOST_DRAWN, VALUES_DRAWN = 128, 2048, 2**21
 # Draws are searched in the noise cells that hold this part of the weight of the first few.
 HELD, FIRST = 0.995, 32
 # All draws are searched in every other cell of so many or more, and this part of them, the largest there, in all.
@@ -40,7 +41,7 @@ SET = ("rate", "temperature", "acceleration", "azimuth", "table", "magnetic", "v
 COURSE, SAME = 32, 0.1
 
 # Counts the rules by which draws have been scored: those kept by an earlier one do not serve.
-RULE = 11
+RULE = 14
 
 _draw = jax.jit(jax.vmap(colour, in_axes=(None, 0)))
 
@@ -75,9 +76,7 @@ def null_scores(
         return np.asarray(_draw(filter, jax.numpy.asarray(rng.standard_normal((count, rows))))).T
 
     cells = [0] if scanner.stated else scanner.only_cells or _cells_of(scanner, columns, draw(FIRST))
-    together = min(
-        max(VALUES_TOGETHER // rows, LEAST_TOGETHER), MOST_TOGETHER, -(-draws // LEAST_TOGETHER) * LEAST_TOGETHER
-    )
+    together = min(max(VALUES_DRAWN // rows, LEAST_DRAWN), MOST_DRAWN, -(-draws // LEAST_DRAWN) * LEAST_DRAWN)
     first = (scanner.checked(cells) if len(cells) >= FEWEST_CELLS else []) or cells
     rest, scores = [g for g in cells if g not in first], []
     for start in range(0, draws, together):

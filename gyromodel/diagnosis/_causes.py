@@ -73,7 +73,8 @@ def cause_of(
             continues = name in ranking.tangents
             parameters = tuple(_told(p, step.effect, part, continues, stated.get(p.name)) for p in parameters)
         if isinstance(step.effect, BiasStep):
-            parameters = tuple(_dated(scanner, estimate, turn, g, p) for p in parameters)
+            own = [e for e in estimate.model.effects if isinstance(e, BiasStep)][-turn]
+            parameters = tuple(_dated(scanner, ranking, own, g, p) for p in parameters)
     return Cause(name, parameters, statistic, p, adjusted, members.get(name, 0.0), confusers, step.points)
 
 
@@ -94,24 +95,25 @@ def _told(
     return replace(parameter, ci95=(low, high))
 
 
-def _dated(scanner: Scanner, estimate: Estimate, turn: int, g: int, parameter: ParameterValue) -> ParameterValue:
-    """The epoch of the step that stands `turn` from the last, with its interval; any other parameter as it is."""
+def _dated(scanner: Scanner, ranking: Ranking, step: BiasStep, g: int, parameter: ParameterValue) -> ParameterValue:
+    """The epoch of a step with its interval, beside what a ranking is beside; any other parameter as it is."""
     if parameter.name != "epoch":
         return parameter
-    own = [e for e in estimate.model.effects if isinstance(e, BiasStep)][-turn]
-    std, low, high = epoch_interval(scanner, estimate, own, g)
+    std, low, high = epoch_interval(scanner, ranking.baseline_columns, ranking.residual, step, g)
     scale = factor("s", parameter.unit)
     return replace(parameter, std=std * scale, ci95=(low * scale, high * scale))
 
 
 def _point_parameters(scanner: Scanner, estimate: Estimate, rows: tuple[int, ...]) -> tuple[ParameterValue, ...]:
     """How far each anomalous point lies from the model, fitted beside all of them in the noise as it was fitted."""
-    record, points = scanner.record, scanner.points_among(rows)
+    points, given_up = scanner.points_among(rows), scanner.present & ~np.asarray(estimate.record.sampling.present)
+    others = np.setdiff1d(np.flatnonzero(given_up), rows)
+    record = scanner.record.without(others) if len(others) else scanner.record
     predicted, jacobian = (np.asarray(part) for part in estimate.model.linearise(record.signals))
     marks = np.zeros((len(predicted), len(points)))
     for i, p in enumerate(points):
         marks[p, i] = np.asarray(estimate.model.slope(record.signals))[p]
-    residual = np.where(scanner.present, np.asarray(record.signals["output"]) - predicted, 0.0)
+    residual = np.where(record.sampling.present, np.asarray(record.signals["output"]) - predicted, 0.0)
     columns = np.column_stack([marks, jacobian, residual])
     white = np.asarray(whiten_columns(filter_of(record, estimate.ratios), columns))[: record.rows][record.present]
     norm = np.linalg.norm(white[:, :-1], axis=0)

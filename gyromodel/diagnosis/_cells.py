@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import groupby
 from typing import NamedTuple
 
@@ -14,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from gyromodel.diagnosis._bank import Bank
-from gyromodel.diagnosis._evidence import FEW_SETS
 from gyromodel.diagnosis._lines import LineGrid
 from gyromodel.estimate import make_filter, whiten_columns
 from gyromodel.noise import NoiseGrid
@@ -41,7 +39,7 @@ _whiten_rows = jax.jit(whiten_on)
 
 
 @jax.jit
-def precision(filter: Filter, columns):
+def weighted(filter: Filter, columns):
     """V⁻¹x."""
     return whiten_transposed(filter, whiten(filter, columns))
 
@@ -70,14 +68,6 @@ class Pack(NamedTuple):
 
     rows: list[jax.Array]
     parts: list[tuple[int | None, int, int, int]]
-
-
-class Products(NamedTuple):
-    """V⁻¹x of a baseline's columns and residuals, and the inner products of the candidates' columns with each."""
-
-    z: np.ndarray
-    baseline: np.ndarray
-    residuals: np.ndarray
 
 
 class Cells:
@@ -171,32 +161,24 @@ class Cells:
             groups += [same[i : i + together] for i in range(0, len(same), together)]
         return groups
 
-    def inner_products(self, group: Sequence[int], data: np.ndarray, exact: int) -> list[Products]:
-        """Per cell of a group, V⁻¹x of the data's columns and its inner products with the candidates' columns.
-
-        Where all columns but the first `exact` are so many that they are draws, they have theirs in single precision.
-        """
+    def precision(self, g: int, data: np.ndarray) -> np.ndarray:
+        """V⁻¹x of the data's columns in one noise cell."""
         columns = data.shape[1]
-        step = FEW_STEP if columns <= FEW_COLUMNS else COLUMN_STEP
-        data = np.pad(data, ((0, 0), (0, -columns % step)))
+        return np.asarray(weighted(self[g].filter, np.pad(data, ((0, 0), (0, -columns % COLUMN_STEP)))))[:, :columns]
+
+    def inner_products(self, group: Sequence[int], data: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Per cell of a group, V⁻¹x of the data's columns and its inner products with the candidates' columns."""
+        columns = data.shape[1]
         if columns > FEW_COLUMNS:
-            z = np.asarray(precision(self[group[0]].filter, data))[:, :columns]
-            if columns - exact <= FEW_SETS:
-                cross = self._columns.T @ z
-                return [Products(z, cross[:, :exact], cross[:, exact:])]
-            drawn = np.ascontiguousarray(z[:, exact:], np.float32)
-            return [Products(z, self._columns.T @ z[:, :exact], self._columns_single.T @ drawn)]
+            found = (self.precision(g, data) for g in group)
+            return [(z, self._columns.T @ z) for z in found]
+        data = np.pad(data, ((0, 0), (0, -columns % FEW_STEP)))
         filters = [self[g].filter for g in (*group, *[group[0]] * (CELLS_TOGETHER - len(group)))]
         gain, scale = (np.stack([np.asarray(getattr(f, part)) for f in filters], axis=-1) for part in ("gain", "scale"))
-        z = np.asarray(precision(filters[0]._replace(gain=gain, scale=scale), data))[:, :columns, : len(group)]
+        z = np.asarray(weighted(filters[0]._replace(gain=gain, scale=scale), data))[:, :columns, : len(group)]
         z = np.ascontiguousarray(z.transpose(0, 2, 1))
         cross = (self._columns.T @ z.reshape(len(z), -1)).reshape(-1, len(group), columns)
-        return [Products(z[:, i], cross[:, i, :exact], cross[:, i, exact:]) for i in range(len(group))]
-
-    @cached_property
-    def _columns_single(self) -> np.ndarray:
-        """The candidates' columns in single precision."""
-        return self._columns.astype(np.float32)
+        return [(z[:, i], cross[:, i]) for i in range(len(group))]
 
 
 def _add_squares(total: np.ndarray, columns: np.ndarray) -> None:

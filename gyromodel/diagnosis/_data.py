@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from gyromodel._checks import CampaignError
 from gyromodel.attitude import refuse_navigated, with_reference_rates
@@ -24,6 +25,8 @@ from gyromodel.units import convertible
 MEAN_OF_POSE = 1.0
 # Part of its range within which a column stands still in a stretch; stretches that may be runs, fewer than are dwells.
 STILL, MOST_STRETCHES = 0.1, 11
+# Gaps between more stretches than these are no power cycles.
+MOST_POWER_CYCLES = 60
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,7 @@ class Data:
         step: of the coarsest reading that the output is computed from, internal units; zero where none shows.
         readings: how a gyro's output is read.
         stepped: findings on that, for where its steps are no cause.
+        time_on: where no column numbers runs, the signal `time_on` if the gyro was off in every gap; none without gaps.
     """
 
     record: Record
@@ -53,6 +57,7 @@ class Data:
     step: float = 0.0
     readings: Readings = field(default_factory=Readings)
     stepped: tuple[str, ...] = ()
+    time_on: Float[Array, " sample"] | None = None
 
 
 def read(measured: Sequence[Campaign], without: str = "") -> Data:
@@ -98,8 +103,8 @@ def _of_gyro(measured: Sequence[Campaign]) -> Data:
         most = max(m for _, m in shortened)
         shortened = [(as_rate(c), m) for c, m in shortened]
         findings.append(
-            f"Means of {most} consecutive samples were searched: lines above their sample rate and quantisation are "
-            "averaged away."
+            f"Means of {most} consecutive samples were searched: lines above half their sample rate and quantisation "
+            "are averaged away."
         )
     far = dict.fromkeys(n for c, (_, m) in zip(campaigns, shortened, strict=True) for n in turning(c, m))
     findings += [f"{n} turns by more than {MOST_TURN:g} deg within a mean, which weakens what follows it." for n in far]
@@ -120,8 +125,10 @@ def _of_gyro(measured: Sequence[Campaign]) -> Data:
     ]
     if any(m > 1 for _, m in shortened):
         record = _of_means(record, campaigns, searched)
-    if "run" in searched[0].columns and "run" not in as_given[0].columns:
-        record = _without_power_cycles(record, searched[0])
+    time_on = None
+    if len(as_given) == 1 and "run" not in as_given[0].columns:
+        time_on = _since_gaps(record)
+        record = _without_power_cycles(record, searched[0]) if "run" in searched[0].columns else record
     output_unit = campaigns[0].units["output"]
     if campaigns[0].metadata["kind"] != "rate":
         output_unit = f"{output_unit}/s"
@@ -129,13 +136,23 @@ def _of_gyro(measured: Sequence[Campaign]) -> Data:
     rows_of = tuple((c, len(c) == len(m)) for c, m in zip(searched, measured, strict=True))
     readings = readings_of(campaigns, searched)
     unit = _rate_unit(campaigns[0])
-    return Data(record, searched, rows_of, whole, tuple(findings), unit, output_unit, 0.0, readings, stepped)
+    return Data(record, searched, rows_of, whole, tuple(findings), unit, output_unit, 0.0, readings, stepped, time_on)
 
 
 def _without_power_cycles(record: Record, campaign: Campaign) -> Record:
     """The record of one campaign, its runs being stretches: nothing tells that the gyro was off between them."""
     time_on = record.signals["time"] + time_since_power_on(campaign)
     return record._replace(signals=record.signals | {"time_on": time_on})
+
+
+def _since_gaps(record: Record) -> Float[Array, " sample"] | None:
+    """Time since the last gap; none without one, or with so many that they are no power cycles."""
+    time = np.asarray(record.signals["time"])
+    stretch = stretches_of(time[: record.rows])
+    if not 0 < stretch.max() < MOST_POWER_CYCLES:
+        return None
+    begins = time[np.searchsorted(stretch, np.arange(stretch.max() + 1))]
+    return jnp.asarray(time - np.pad(begins[stretch], (0, len(time) - record.rows), mode="edge"))
 
 
 def _of_means(record: Record, campaigns: Sequence[Campaign], means: Sequence[Campaign]) -> Record:

@@ -11,11 +11,11 @@ from threadpoolctl import threadpool_limits
 from gyromodel._checks import listed
 from gyromodel._noise_level import with_stated_level
 from gyromodel.campaign import Campaign
-from gyromodel.diagnosis._account import evidence_at_sizes, more_needed, p_value_of, rounds_of
+from gyromodel.diagnosis._account import as_added, evidence_at_sizes, more_needed, p_value_of, rounds_of
 from gyromodel.diagnosis._calibrate import null_scores, threshold_of
 from gyromodel.diagnosis._data import Data, read
 from gyromodel.diagnosis._extended import finished, stated_counts, stated_hops, stated_level
-from gyromodel.diagnosis._gain import nested_gain, no_gain, not_measured
+from gyromodel.diagnosis._gain import nested_gain, no_gain, not_measured, with_predictable_blocks
 from gyromodel.diagnosis._intervals import CLEARER, COUNTED, HALF, over_intervals
 from gyromodel.diagnosis._isolation import settling_test
 from gyromodel.diagnosis._misfit import excess_band, unexplained_axes
@@ -28,6 +28,7 @@ from gyromodel.diagnosis._session import (
     Session,
     laid_out,
     over_angle_noise,
+    over_power_cycles,
     over_smooth_thermometers,
     over_unrounded,
     over_weighted,
@@ -54,6 +55,10 @@ FEWEST_DRAWS = 200
 ROUNDINGS = 3
 # Folds search the noise cells within this many nats of the best of the main pass.
 FOLD_NEARBY = 3.0
+TURNED_ON = (
+    "There seems to be a warm-up behind every gap, as if the gyro had been off: its time is counted from there. The "
+    "model is applied to files whose column run tells power cycles apart."
+)
 SMOOTHED = (
     "Temperatures were smoothed: the error follows the smooth record better, so that the rest is noise of the "
     "thermometer, which the model adds where it is applied to temperatures as they were read."
@@ -110,6 +115,7 @@ def _diagnosed(
     check_covariates(record, model)
     _refuse_missing(measured, data, model)
     record, left_out = with_columns_known(record)
+    record = with_predictable_blocks(record, model)
     record = with_stated_level(record, model)
     findings += left_out
     say("fitting the simulation", 0.02)
@@ -142,6 +148,9 @@ def _diagnosed(
     if rounding.changed and (left_out := int(np.sum(record.present & ~session.record.present))):
         findings.append(f"{left_out} samples that stand apart from all others were left out beside rounding.")
     session, selection = over_angle_noise(session, selection, model, say) or (session, selection)
+    if data.time_on is not None and (others := over_power_cycles(session, selection, data.time_on, model, say)):
+        session, selection = others
+        findings.append(TURNED_ON)
     if record.domain == "gyro" and (others := over_smooth_thermometers(session, selection, model, say)):
         session, selection = others
         findings.append(SMOOTHED)
@@ -149,7 +158,7 @@ def _diagnosed(
     # What rounding leaves is larger at edges of steps, where there is much more to tell than tails.
     plain = record.domain == "gyro" and not rounding.saw_tooth
     grows, following = None if rounding.saw_tooth else growing_noise(session.record, selection.estimate), None
-    others = over_weighted(session, grows.white, model, say) if grows else None
+    others = over_weighted(session, grows, model, say) if grows else None
     grows = grows if others else None
     if grows and others:
         session, selection = others
@@ -181,7 +190,7 @@ def _diagnosed(
     if hops is not None:
         beyond.append(hops)
         findings.append("Fits take hops of the bias for noise of a like variance and correlation.")
-        first = selection.path[0].ranking if selection.path else selection.last
+        first = selection.first
         start = _with_noise_estimated(baseline) or baseline
         selection = Selection(start, (), (), first, (start,), None)
     if hold_out:
@@ -212,7 +221,7 @@ def _diagnosed(
     read_so = readings.same_as(reading)
     judgement = judge(session.steps, selection, extended, len(names), nulls, data.rows_of, rounding.saw_tooth, read_so)
     # What follows itself at one end of a column has structure, whatever faint name takes a part of it.
-    if following and grows and all(c.statistic < FAINT for c in judgement.causes):
+    if following and grows and all(c.statistic < FAINT for c in judgement.causes if c.effect != "outliers"):
         judgement = structured(judgement, selection.last, grows.column)
     stepped = free = band = None
     if plain and not selection.unfinished and (free := _with_noise_estimated(selection.estimate)):
@@ -275,7 +284,8 @@ def _diagnosed(
     output, left = (np.asarray(r.signals["output"])[: record.rows] for r in (as_it_was, record))
     before, after = before + output - left, after + output - left
     output = np.where(record.present, output, np.nan)
-    sizes = minimum_detectable(session.scanner, selection.last, session.threshold, unit)
+    added = as_added(selection, judgement.credible_set)
+    sizes = minimum_detectable(session.scanner, selection.last, added, session.threshold, unit)
     steps_searched = record.domain == "gyro" and not readings.untested
     if steps_searched and not coarse:
         sizes["quantisation"] = readings.least(as_it_was, extended), readings.unit
@@ -364,7 +374,7 @@ def _like_hops(selection: Selection, free: Estimate) -> bool:
 
 def _gain(session: Session, baseline: Estimate, selection: Selection, unit: str, scale: float, ordinary, say) -> Gain:
     if not any(f.effect is not None or f.frees_noise for f in selection.found):
-        return no_gain(session.record, baseline, unit, scale)
+        return no_gain(session.record, session.ladder(baseline)[0] * scale, unit)
 
     rankings = [f.ranking for f in selection.path] + [selection.last]
     noise = [e.ratios for e in selection.estimates]

@@ -1,7 +1,8 @@
 """What an unknown discrepancy may follow: columns, their rates, what they were before, and time; and its name.
 
 A driver's name is "smooth(a)" or "smooth(a, b)"; d(a)/dt stands for the rate of column a, a[earlier] for what follows
-it some time later: its value, or of the rate its root mean square.
+it some time later: its value, or of the rate its root mean square; rate[behind] for what follows the rate itself, less
+the rate.
 """
 
 from __future__ import annotations
@@ -11,10 +12,10 @@ import re
 import numpy as np
 
 from gyromodel._checks import DERIVED, NUMBERED, thermometers
-from gyromodel.declarations import RATE_OF, measured
+from gyromodel.declarations import BEHIND, RATE_OF, measured
 from gyromodel.signals import Record
 
-RESPONSE_DRIVER = f"smooth({RATE_OF.format('rate')})"
+RESPONSE_DRIVER, RECOVERY_DRIVER = f"smooth({RATE_OF.format('rate')})", f"smooth({BEHIND.format('rate')})"
 # A current of which this part follows the output's noise is the output, if it is so many over the root of the samples:
 # four standard errors, as neighbouring second differences of noise are alike. How many times their median are no jump.
 ALIKE, CERTAIN, NO_JUMP = 0.1, 5.6, 4.0

@@ -2,44 +2,41 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from gyromodel.diagnosis._cells import COLUMN_STEP, precision
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._tangents import VANISHED
 from gyromodel.effects.drivers import BiasStep
-from gyromodel.estimate import Estimate
 
 # Share of the posterior that the interval holds.
 CREDIBLE = 0.95
 
 
-def epoch_interval(scanner: Scanner, estimate: Estimate, step: BiasStep, g: int) -> tuple[float, float, float]:
-    """Standard uncertainty (s) and 95 % interval of the epoch of one of a model's steps, in one noise cell.
+def epoch_interval(
+    scanner: Scanner, columns: np.ndarray, residual: np.ndarray, step: BiasStep, g: int
+) -> tuple[float, float, float]:
+    """Standard uncertainty (s) and 95 % interval of the epoch of a step, in one noise cell.
 
     Every moment of its run is as likely beforehand. Given the data p(k) ∝ w_k (RSS − t_k)^(−(ν−1)/2) / √a_k, w_k the
     time between a sample and the one before, t_k what a step there explains beside everything else, a_k the energy of
     a unit step; the sizes of step and noise are integrated out. Between two samples all moments are alike.
+
+    Args:
+        scanner: the search.
+        columns: of everything else, any scale.
+        residual: what everything else leaves, as a rate.
+        step: the step.
+        g: the cell.
     """
-    model, record = estimate.model, scanner.record
-    others = replace(model, effects=tuple(e for e in model.effects if e is not step))
-    predicted, jacobian = others.linearise(record.signals)
-    given_up = np.flatnonzero(scanner.present & ~np.asarray(estimate.record.sampling.present))
-    marks = np.zeros((len(scanner.present), len(given_up)))
-    marks[given_up, np.arange(len(given_up))] = 1.0
-    residual = (np.asarray(record.signals["output"]) - predicted) / float(model.gain())
-    x = np.where(scanner.present[:, None], np.column_stack([jacobian, marks, residual]), 0.0)
+    record = scanner.record
+    x = np.where(scanner.present[:, None], np.column_stack([columns, residual]), 0.0)
     x = x / np.maximum(np.linalg.norm(x, axis=0), 1e-300)
-    padded = np.pad(x, ((0, 0), (0, -x.shape[1] % COLUMN_STEP)))
-    cell = scanner.cells[g]
-    z = np.asarray(precision(cell.filter, padded))[:, : x.shape[1]]
+    z = scanner.cells.precision(g, x)
     gram = x.T @ z
     inner = np.linalg.lstsq(gram[:-1, :-1], gram[:-1], rcond=1e-13)[0]
     after = scanner.to_run_end(np.cumsum(z[::-1], axis=0)[::-1])
     along = after[:, -1] - after[:, :-1] @ inner[:, -1]
-    own = scanner.to_run_end(cell.step)
+    own = scanner.to_run_end(scanner.cells[g].step)
     energy = own - np.sum(after[:, :-1] * (after[:, :-1] @ np.linalg.pinv(gram[:-1, :-1], rcond=1e-13)), axis=1)
     run = record.run[scanner.epochs]
     within = run == (record.run_numbers.index(step.campaign) if step.campaign else 0)

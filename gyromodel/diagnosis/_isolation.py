@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from gyromodel._model_units import parameter_unit
 from gyromodel._noise_level import with_stated_level
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._added_tests import added_tests
@@ -21,7 +22,7 @@ from gyromodel.diagnosis._scan import epochs_of
 from gyromodel.effects import CATALOGUE, Effect, Signals
 from gyromodel.effects._base import evaluate
 from gyromodel.estimate import Estimate, as_read, filter_of, given_ratios, step_of, whiten_columns
-from gyromodel.model import GyroModel, ModelError, effect_class, make_effect, parameter_unit
+from gyromodel.model import GyroModel, ModelError, effect_class, make_effect
 from gyromodel.noise import NoiseRatios
 from gyromodel.signals import Record, read_signals, with_columns_known
 from gyromodel.units import factor, internal_unit

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -52,6 +53,7 @@ class LineGrid:
     Attributes:
         frequencies: searched in each run, ascending.
         run: of each sample, from 0.
+        rows: samples without padding.
         campaigns: by which effects know each run.
         unseen: of each line, whether its run has too few cycles of it, or samples a cycle.
         index: each sample's place on a regular grid of times.
@@ -63,6 +65,7 @@ class LineGrid:
 
     frequencies: np.ndarray
     run: np.ndarray
+    rows: int
     campaigns: tuple[int, ...]
     unseen: np.ndarray
     index: np.ndarray
@@ -98,17 +101,23 @@ class LineGrid:
         """Inner products of columns with the cosine and with the sine of every line."""
         here = slice(self.first, self.first + len(self.frequencies))
         found = []
-        for _, rows in self.runs_within(0, len(columns)):
+        for rows, at, begins in self._places:
             spread = np.zeros((columns.shape[1], self.length), columns.dtype)
-            for on_grid, column in zip(spread, columns.T, strict=True):
-                on_grid[:] = np.bincount(self.index[rows], column[rows], self.length)
+            own = columns[rows]
+            spread[:, at] = (np.add.reduceat(own, begins) if len(begins) < len(own) else own).T
             found.append(np.asarray(scipy.fft.rfft(spread, axis=1))[:, here])
         both = np.concatenate(found, axis=1).T
         return np.real(both), -np.imag(both)
 
+    @cached_property
+    def _places(self) -> list[tuple[slice, np.ndarray, np.ndarray]]:
+        """Rows of each run, the places on the grid that they have, and which rows are the first there."""
+        runs = self.runs_within(0, self.rows)
+        return [(rows, *np.unique(self.index[rows], return_index=True)) for _, rows in runs]
+
     def barred(self, lines: Sequence[Line]) -> np.ndarray:
         """Which lines their run does not show, or does not resolve from any of some lines."""
-        near, barred = RESOLVED * (self.frequencies[1] - self.frequencies[0]), self.unseen
+        near, barred = RESOLVED * self.frequencies[0] / self.first, self.unseen
         for line in lines:
             there = np.isin(self.campaigns, line.campaign) if line.campaign else np.ones(len(self.campaigns), bool)
             barred = barred | np.outer(there, np.abs(self.frequencies - line.frequency) < near).ravel()
@@ -129,6 +138,11 @@ class LineGrid:
         return np.stack([np.stack([cc, cs], axis=-1), np.stack([cs, ss], axis=-1)], axis=-2)
 
 
+def _highest(interval: float, span: float) -> float:
+    """Half the sample rate, less half the resolution: nearer to it a sine fades."""
+    return 0.5 / interval - 0.49 / (span + interval)
+
+
 def line_grid(record: Record) -> LineGrid | None:
     """A quarter of the record's resolution, up to half the sample rate; None where that leaves no frequency."""
     time = np.asarray(record.signals["time"])
@@ -143,29 +157,34 @@ def line_grid(record: Record) -> LineGrid | None:
     length = cast(int, scipy.fft.next_fast_len(int(np.ceil(4.0 * (span + grid) / grid)), real=True))
     first = int(np.ceil(FEWEST_CYCLES / span * length * grid))
     frequencies = np.arange(first, length // 2 + 1) / (length * grid)
-    # Nearer to half the sample rate than half the resolution, a sine fades.
-    frequencies = frequencies[frequencies < 0.5 / record.interval - 0.49 / (span + record.interval)]
+    frequencies = frequencies[frequencies < _highest(record.interval, span)]
     if not len(frequencies):
         return None
-    exact = np.arange(min(LOWEST_LINES, len(frequencies)))
-    spaced = np.geomspace(len(exact) + 1, len(frequencies), SPACED_LINES).round().astype(int) - 1
-    highest = np.arange(len(frequencies) - HIGHEST_LINES, len(frequencies))
-    exact = np.unique(np.concatenate([exact, spaced, highest]).clip(0, len(frequencies) - 1))
     index = np.minimum(np.round(time / grid).astype(int), length - 1)
     angle = 2.0 * np.pi * np.arange(length) / length
     run = record.run
-    unseen = []
-    for own in (time[: record.rows][run[: record.rows] == r] for r in range(run[-1] + 1)):
-        slow = frequencies * (np.ptp(own) + 1e-9 * span) < FEWEST_CYCLES
-        unseen += [slow | (frequencies > 0.5 / np.median(np.diff(own))) if len(own) > 1 else slow]
+    # Median interval and span of each run.
+    each = (time[: record.rows][run[: record.rows] == r] for r in range(run[-1] + 1))
+    runs = [(float(np.median(np.diff(own))) if len(own) > 1 else record.interval, float(np.ptp(own))) for own in each]
+    unseen = [
+        (frequencies * (lasting + 1e-9 * span) < FEWEST_CYCLES) | (frequencies > _highest(step, lasting))
+        for step, lasting in runs
+    ]
+    # A quarter of a run's resolution apart, which is more than one step of the grid for runs shorter than the longest.
+    spaced = np.geomspace(min(LOWEST_LINES, len(frequencies) - 1) + 1, len(frequencies), SPACED_LINES)
+    exact = [spaced.round().astype(int) - 1]
+    for (step, lasting), out in zip(runs, unseen, strict=True):
+        seen, stride = np.flatnonzero(~out), max(round(span / (lasting + step)), 1)
+        exact += [seen[::stride][:LOWEST_LINES], seen[::-stride][:HIGHEST_LINES]]
     return LineGrid(
         frequencies,
         run,
+        record.rows,
         record.run_numbers,
         np.concatenate(unseen),
         index,
         length,
         first,
-        exact,
+        np.unique(np.concatenate(exact)),
         (np.cos(angle), np.sin(angle)),
     )

@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
 from scipy.special import gammaln
 
 from gyromodel.diagnosis._batch import Batch
 from gyromodel.diagnosis._evidence import (
-    FEW_SETS,
     evidence_of_draws,
     log_evidence_ratio,
-    log_mean_evidence,
+    log_mean,
     log_mean_of_parts,
+    mean_evidence_of_draws,
 )
 from gyromodel.diagnosis._lines import PEAK_WIDTH, PEAKS
 from gyromodel.diagnosis._tangents import VANISHED
 
 if TYPE_CHECKING:
-    from gyromodel.diagnosis._cells import Products
     from gyromodel.diagnosis._scan import Scanner
 
 # A column's energy, as a part of the greatest of its block, that single precision takes for none.
@@ -32,46 +31,162 @@ SINGULAR = 1e-10
 CLEARLY = 4.0
 # Lines whose interpolated statistic, were it this much larger, would not pay for the search are left interpolated.
 PEAK_SLACK = 1.5
-# Data sets whose lines are worked out at once: as many as stay in the processor's cache.
+# Data sets whose lines, or sets of points, are worked out at once: as many as stay in the processor's cache.
 SETS_TOGETHER = 16
 # Further gross errors that are given up with the greatest: evidence of each alone (nats), the search over rows paid
 # for, and rows to the next, as errors side by side share theirs.
 ERROR_MARGIN, ERROR_DISTANCE = 8.0, 3
 
 
-class OneCell:
-    """What a baseline leaves of residuals in one noise cell; each method adds candidates' evidence to `batch`.
+class Width(NamedTuple):
+    """The blocks of one number of columns beside a baseline.
+
+    `turn` takes a block's columns to orthonormal directions of what is left of them, `left` in number, and to zeros;
+    `energy` is what is left on average; `blocks` and `columns` are where they stand.
+    """
+
+    blocks: slice
+    columns: slice
+    turn: np.ndarray
+    left: np.ndarray
+    energy: np.ndarray
+
+
+class Beside:
+    """What a baseline leaves of every candidate in one noise cell, whatever the data are.
 
     Args:
         scanner: the search, and its cells.
         g: which cell.
-        x: the baseline's columns, then the residuals, after `first` others.
-        products: V⁻¹x, and its inner products with the candidates' columns; of many residuals in single precision.
-        first: how many columns are neither.
-        p: how many columns are the baseline's.
+        x: the baseline's columns.
+        z: V⁻¹x.
+        cross: inner products of the candidates' columns with z.
+        barred: lines that are not searched.
+        suspected: the rows of each point that may be anomalous in any of the data.
     """
 
-    def __init__(self, scanner: Scanner, g: int, x: np.ndarray, products: Products, first: int, p: int) -> None:
-        self._scanner, self._g, self._cell = scanner, g, scanner.cells[g]
-        x, z = x[:, first:], products.z[:, first:]
-        against = x[:, :p].T @ z
-        norm = np.sqrt(np.maximum(np.diag(against)[:p], 1e-300))
-        scaled = against[:, :p] / np.outer(norm, norm) + 1e-13 * np.eye(p)
+    def __init__(
+        self,
+        scanner: Scanner,
+        g: int,
+        x: np.ndarray,
+        z: np.ndarray,
+        cross: np.ndarray,
+        barred: np.ndarray,
+        suspected: Sequence[np.ndarray],
+    ) -> None:
+        self.scanner, self.g, self.cell, self._barred = scanner, g, scanner.cells[g], barred
+        self.suspected = suspected
+        against = x.T @ z
+        norm = np.sqrt(np.maximum(np.diag(against), 1e-300))
+        scaled = against / np.outer(norm, norm) + 1e-13 * np.eye(len(norm))
         root = np.linalg.inv(np.linalg.cholesky(scaled)) / norm
-        jy = root @ against[:, p:]
-        self._nu = nu = scanner.degrees_of_freedom - p
-        rss = np.einsum("ij,ij->j", x[:, p:], z[:, p:]) - np.sum(jy**2, axis=0)
-        rss = np.maximum(rss, max(nu * scanner.least, 1e-300))
-        log_j = 2.0 * np.log(norm).sum() + np.linalg.slogdet(scaled)[1]
-        log_likelihood = -0.5 * self._cell.log_determinant - 0.5 * log_j - 0.5 * nu * np.log(rss)
-        self.batch = Batch(log_likelihood, rss, {}, {}, {}, {})
-        # V⁻¹ of the baseline's orthonormal columns and of what they leave; the candidates' inner products with both.
-        self._zj = z[:, :p] @ root.T
-        self._cross_j = products.baseline[:, first:] @ root.T
-        kind = products.residuals.dtype
-        self._zy = np.asarray(z[:, p:] - self._zj @ jy, kind)
-        self._cross_y = products.residuals - self._cross_j.astype(kind) @ jy.astype(kind)
-        self._rss = rss.astype(kind)
+        self.nu = scanner.degrees_of_freedom - len(norm)
+        self.log_determinant = self.cell.log_determinant + 2.0 * np.log(norm).sum() + np.linalg.slogdet(scaled)[1]
+        # V⁻¹ of the baseline's orthonormal columns, and the candidates' inner products with it.
+        self.z, self.cross = z @ root.T, cross @ root.T
+
+    @cached_property
+    def widths(self) -> list[Width]:
+        """What is left of the blocks, by their number of columns."""
+        found = []
+        for q, (first, count, start) in self.scanner.bank.layout().items():
+            blocks, columns, own = slice(first, first + count), slice(start, start + q * count), self.cell.blocks[q]
+            c = self.cross[columns].reshape(count, q, -1)
+            square = np.einsum("bii->bi", own)
+            # A column that is nothing beside the others of its block has no direction.
+            norm = np.sqrt(np.where(square > NOTHING * square.max(axis=1, keepdims=True), square, np.inf))
+            values, vectors = np.linalg.eigh((own - c @ c.transpose(0, 2, 1)) / (norm[:, :, None] * norm[:, None, :]))
+            keep = values > VANISHED
+            turn = vectors / norm[:, :, None] * np.where(keep, np.where(keep, values, 1.0) ** -0.5, 0.0)[:, None, :]
+            left = keep.sum(axis=1)
+            energy = np.sum(values * keep, axis=1) / np.maximum(left, 1) * np.mean(square, axis=1)
+            found.append(Width(blocks, columns, turn, left, energy))
+        return found
+
+    @cached_property
+    def turned(self) -> list[np.ndarray]:
+        """The columns along those directions, of each width, in single precision; one row each."""
+        columns, found = self.scanner.bank.columns[: self.scanner.record.rows], []
+        for width in self.widths:
+            own = columns[:, width.columns].reshape(len(columns), *width.turn.shape[:2]).transpose(1, 2, 0)
+            found.append((width.turn.transpose(0, 2, 1) @ own).reshape(-1, len(columns)).astype(np.float32))
+        return found
+
+    @cached_property
+    def steps(self) -> np.ndarray:
+        """What is left of a step before each epoch."""
+        to_end = self.scanner.to_run_end
+        return _left(to_end(self.cell.step), to_end(np.cumsum(self.z[::-1], axis=0)[::-1]))
+
+    def pulses(self, rows: np.ndarray) -> np.ndarray:
+        """What is left of single rows."""
+        return _left(self.cell.pulse[rows], self.z[rows])
+
+    @cached_property
+    def points(self) -> tuple[np.ndarray, np.ndarray]:
+        """What is left of the suspected points and they share, each of unit length whitened; and these lengths."""
+        marks = np.zeros((len(self.z), len(self.suspected)))
+        for column, rows in zip(marks.T, self.suspected, strict=True):
+            column[rows] = 1.0
+        w, cross = self.scanner.cells.whiten(self.g, marks), marks.T @ self.z
+        length = np.linalg.norm(w, axis=0)
+        return (w.T @ w - cross @ cross.T) / np.outer(length, length), length
+
+    @cached_property
+    def lines(self) -> Lines:
+        """What is left of every line."""
+        assert self.scanner.lines is not None
+        own = self.cell.line
+        cosine, sine = self.scanner.lines.spectrum(self.z)
+        a11 = own[:, 0, 0] - np.sum(cosine**2, axis=1)
+        a22 = own[:, 1, 1] - np.sum(sine**2, axis=1)
+        a12 = own[:, 0, 1] - np.sum(cosine * sine, axis=1)
+        determinant = a11 * a22 - a12**2
+        keep = (determinant > 1e-3 * own[:, 0, 0] * own[:, 1, 1]) & (a11 > 0) & ~self._barred
+        a22, determinant = np.where(keep, a22, 1.0), np.where(keep, determinant, 1.0)
+        parts = (np.where(keep, x, 0.0) for x in (np.sqrt(a22 / determinant), a12 / a22, a22**-0.5, a11))
+        return Lines(cosine, sine, *parts)
+
+
+class Lines(NamedTuple):
+    """Lines beside a baseline: inner products of their waves with it, and what is left of them.
+
+    Of inner products c and s with the data a line explains (along (c − lean s))² + (across s)².
+    """
+
+    cosine: np.ndarray
+    sine: np.ndarray
+    along: np.ndarray
+    lean: np.ndarray
+    across: np.ndarray
+    energy: np.ndarray
+
+
+class OneCell:
+    """What a baseline leaves of residuals in one noise cell; each method adds candidates' evidence to `batch`.
+
+    Args:
+        beside: the baseline there.
+        y: the residuals.
+        z: V⁻¹y.
+        cross: inner products of the candidates' columns with z; none of draws, which have theirs in single precision.
+    """
+
+    def __init__(self, beside: Beside, y: np.ndarray, z: np.ndarray, cross: np.ndarray | None) -> None:
+        self._beside, self._scanner = beside, beside.scanner
+        jy = beside.z.T @ y
+        self._nu = nu = beside.nu
+        rss = np.einsum("ij,ij->j", y, z) - np.sum(jy**2, axis=0)
+        rss = np.maximum(rss, max(nu * self._scanner.least, 1e-300))
+        self.batch = Batch(-0.5 * beside.log_determinant - 0.5 * nu * np.log(rss), rss, {}, {}, {}, {})
+        # V⁻¹ of what the baseline leaves of the residuals, and the candidates' inner products with it.
+        self._zy = z - beside.z @ jy
+        self._cross, self._rss = None, rss
+        if cross is not None:
+            self._cross = cross - beside.cross @ jy
+        else:
+            self._zy, self._rss = self._zy.astype(np.float32), rss.astype(np.float32)
 
     def blocks(self, least: np.ndarray, lost: np.ndarray) -> None:
         """Every block's evidence.
@@ -80,43 +195,36 @@ class OneCell:
             least: how many columns of each block must be left beside the baseline.
             lost: blocks that the rows left out told of.
         """
-        batch, nu, table, bank = self.batch, self._nu, self._scanner.table, self._scanner.bank
-        blocks, draws, kind = len(bank.blocks), self._cross_y.shape[1], self._cross_y.dtype
-        t_of, q_of, energy = np.zeros((blocks, draws), kind), np.zeros(blocks), np.zeros(blocks)
-        for q, (first, count, start) in bank.layout().items():
-            own = self._cell.blocks[q]
-            c = self._cross_j[start : start + q * count].reshape(count, q, -1)
-            b = self._cross_y[start : start + q * count].reshape(count, q, draws)
-            square = np.einsum("bii->bi", own)
-            # A column that is nothing beside the others of its block has no direction.
-            norm = np.sqrt(np.where(square > NOTHING * square.max(axis=1, keepdims=True), square, np.inf))
-            a = (own - c @ c.transpose(0, 2, 1)) / (norm[:, :, None] * norm[:, None, :])
-            values, vectors = np.linalg.eigh(a)
-            keep = values > VANISHED
-            along = (vectors.transpose(0, 2, 1) / norm[:, None, :]).astype(kind) @ b
-            inverse = np.where(keep, 1.0 / np.where(keep, values, 1.0), 0.0).astype(kind)
-            t = np.sum(inverse[:, :, None] * along**2, axis=1)
-            here = slice(first, first + count)
-            out = b[:, 0] < (table.smallest[here] * a[:, 0, 0] * square[:, 0])[:, None]
-            if q > 1 and table.positive[here].any():
-                # What would be clearly negative in one of its coefficients.
-                sizes = vectors @ (inverse[:, :, None] * along)
-                spread = np.sqrt(np.einsum("bij,bj->bi", vectors**2, inverse))
-                noise = np.sqrt(np.maximum(batch.rss - t, 1e-300) / nu)
-                out = (sizes < -CLEARLY * spread[:, :, None] * noise[:, None, :]).any(axis=1)
-            t_of[here] = np.where(table.positive[here, None] & out, 0.0, t)
-            q_of[here] = keep.sum(1)
-            energy[here] = np.sum(values * keep, axis=1) / np.maximum(q_of[here], 1) * np.mean(square, axis=1)
+        batch, nu, table, draws = self.batch, self._nu, self._scanner.table, self._zy.shape[1]
+        t_of = np.zeros((len(self._scanner.bank.blocks), draws), self._zy.dtype)
+        q_of, energy = np.zeros(len(t_of)), np.zeros(len(t_of))
+        for k, (here, columns, turn, left, size) in enumerate(self._beside.widths):
+            if self._cross is None:
+                along = self._beside.turned[k] @ self._zy[: self._scanner.record.rows]
+                along = along.reshape(*turn.shape[:2], draws)
+            else:
+                along = turn.transpose(0, 2, 1) @ self._cross[columns].reshape(*turn.shape[:2], draws)
+            t_of[here], q_of[here], energy[here] = np.einsum("bqd,bqd->bd", along, along), left, size
+            if table.positive[here].any():
+                sizes = turn.astype(along.dtype) @ along
+                if turn.shape[1] == 1:
+                    out = sizes[:, 0] < table.smallest[here, None]
+                else:
+                    # What would be clearly negative in one of its coefficients.
+                    spread = np.sqrt(np.sum(turn**2, axis=2))
+                    noise = np.sqrt(np.maximum(batch.rss - t_of[here], 1e-300) / nu)
+                    out = (sizes < -CLEARLY * spread[:, :, None] * noise[:, None, :]).any(axis=1)
+                t_of[here] = np.where(table.positive[here, None] & out, 0.0, t_of[here])
         # A form that loses more columns than the baseline contains is another form in disguise.
         sound = (q_of >= least) & ~lost
         energy[~sound] = 0.0
         energies = np.split(energy[table.order], table.structure_starts[table.name_starts][1:])
         batch.energy |= dict(zip(table.names, energies, strict=True))
-        if draws > FEW_SETS:
+        if self._cross is None:
             self._names_of_draws(t_of, q_of, sound)
             return
         batch.explained = np.where(sound[:, None], t_of, 0.0)
-        ratio = log_evidence_ratio(t_of, self._rss, nu, q_of[:, None]) - table.price[:, None].astype(kind)
+        ratio = log_evidence_ratio(t_of, self._rss, nu, q_of[:, None]) - table.price[:, None]
         ratio = np.where(sound[:, None], ratio, -np.inf)[table.order]
         # Structures compete by their mean over shapes; the best shape of the best structure stands for the name.
         means, shapes = log_mean_of_parts(ratio, table.structure_starts)
@@ -144,82 +252,80 @@ class OneCell:
 
     def steps(self) -> None:
         """A step before each epoch."""
-        scanner = self._scanner
-        zj, zy = (scanner.to_run_end(np.cumsum(v[::-1], axis=0)[::-1]) for v in (self._zj, self._zy))
-        self._single("bias_step", scanner.epochs, zy, scanner.to_run_end(self._cell.step), zj)
+        epochs, to_end = self._scanner.epochs, self._scanner.to_run_end
+        self._single("bias_step", epochs, to_end(np.cumsum(self._zy[::-1], axis=0)[::-1]), self._beside.steps)
 
     def gross_errors(self, rows: np.ndarray) -> None:
         """Single rows of a series, the greatest and those that are certain beside it."""
-        t = self._single("outliers", rows, self._zy[rows], self._cell.pulse[rows], self._zj[rows])
-        if t.shape[1] == 1 and len(rows):
+        t = self._single("outliers", rows, self._zy[rows], self._beside.pulses(rows))
+        if self._cross is not None and t.shape[1] == 1 and len(rows):
             errors = _gross(t[:, 0], rows, self.batch.rss[0], self._nu)
             self.batch.best["outliers"][0][0] = tuple(int(rows[i]) for i in errors)
 
-    def anomalous_points(self, points: Sequence[np.ndarray], orders: Sequence[np.ndarray]) -> None:
-        """Sets of anomalous points in a robust order, priced by their number; in a series beside single rows."""
-        batch, nu = self.batch, self._nu
-        among = np.unique(np.concatenate(orders))
-        marks = np.zeros((len(self._zj), len(among)))
-        for column, k in zip(marks.T, among, strict=True):
-            column[points[k]] = 1.0
-        w, cross = self._scanner.cells.whiten(self._g, marks), marks.T @ self._zj
-        length = np.linalg.norm(w, axis=0)
-        left, y = (w.T @ w - cross @ cross.T) / np.outer(length, length), marks.T @ self._zy / length[:, None]
+    def anomalous_points(self, count: int, orders: Sequence[np.ndarray]) -> None:
+        """Sets of anomalous points in a robust order, priced by their number; in a series beside single rows.
+
+        Args:
+            count: how many points there are.
+            orders: of each residual, numbers of suspected points.
+        """
+        batch, nu, suspected = self.batch, self._nu, self._beside.suspected
+        left, length = self._beside.points
+        begins = np.cumsum([0, *map(len, suspected[:-1])])
+        y = np.add.reduceat(self._zy[np.concatenate(suspected)], begins, axis=0) / length[:, None]
         evidence, explained, dimension = np.full(len(orders), -np.inf), np.zeros(len(orders)), np.zeros(len(orders))
         best: list[tuple[int, ...]] = [()] * len(orders)
-        every = np.arange(1, min(len(among), nu - 1) + 1)
-        sets = gammaln(len(points) + 1) - gammaln(every + 1) - gammaln(len(points) - every + 1)
-        for i, (order, rss) in enumerate(zip(orders, batch.rss, strict=True)):
-            sizes = every[: len(order)]
-            if not len(sizes):
-                continue
-            price = sets[: len(sizes)] + np.log(len(sizes))
-            chosen = np.searchsorted(among, order[: len(sizes)])
+        numbers = np.minimum([len(order) for order in orders], nu - 1)
+        sizes = np.arange(1, max(numbers.max(), 0) + 1)
+        sets = gammaln(count + 1) - gammaln(sizes + 1) - gammaln(count - sizes + 1)
+        some = np.flatnonzero(numbers > 0)
+        for here in np.split(some, range(SETS_TOGETHER, len(some), SETS_TOGETHER)):
+            held = sizes <= numbers[here, None]
+            chosen = np.zeros(held.shape, int)
+            chosen[held] = np.concatenate([orders[i][: numbers[i]] for i in here] or [[]])
             # What the first, the first two … explain.
-            root = np.linalg.cholesky(left[np.ix_(chosen, chosen)] + SINGULAR * np.eye(len(chosen)))
-            t = np.minimum(np.cumsum(solve_triangular(root, y[chosen, i], lower=True) ** 2), rss)
-            ratio = log_evidence_ratio(t, rss, nu, sizes) - price
-            top = int(np.argmax(ratio))
-            evidence[i], explained[i], dimension[i] = np.logaddexp.reduce(ratio), t[top], top + 1.0
-            best[i] = tuple(sorted(int(r) for k in order[: top + 1] for r in points[k]))
-        if "outliers" not in batch.evidence:
-            batch.evidence["outliers"], batch.best["outliers"] = evidence, (best, explained, dimension)
+            both = left[chosen[:, :, None], chosen[:, None, :]] * (held[:, :, None] & held[:, None, :])
+            both[:, sizes - 1, sizes - 1] += np.where(held, SINGULAR, 1.0)
+            along = np.linalg.solve(np.linalg.cholesky(both), np.where(held, y[chosen, here[:, None]], 0.0)[:, :, None])
+            rss = batch.rss[here, None]
+            t = np.minimum(np.cumsum(along[:, :, 0] ** 2, axis=1), rss)
+            ratio = np.where(held, log_evidence_ratio(t, rss, nu, sizes) - sets - np.log(numbers[here, None]), -np.inf)
+            top = np.argmax(ratio, axis=1)
+            evidence[here], dimension[here] = np.logaddexp.reduce(ratio, axis=1), top + 1.0
+            explained[here] = t[np.arange(len(here)), top]
+            if self._cross is not None:
+                for i, last in zip(here, top, strict=True):
+                    best[i] = tuple(sorted(int(r) for k in orders[i][: last + 1] for r in suspected[k]))
+        single = batch.evidence.get("outliers")
+        if single is None:
             batch.energy["outliers"] = np.diag(left)
+        batch.evidence["outliers"] = evidence if single is None else np.logaddexp(single, evidence)
+        if self._cross is None:
             return
-        single, (rows, alone, one) = batch.evidence["outliers"], batch.best["outliers"]
-        whole = evidence > single
-        batch.evidence["outliers"] = np.logaddexp(single, evidence)
+        whole = np.ones(len(evidence), bool) if single is None else evidence > single
+        rows, alone, one = batch.best.get("outliers", (best, explained, dimension))
         batch.best["outliers"] = (
             [b if w else r for w, b, r in zip(whole, best, rows, strict=True)],
             np.where(whole, explained, alone),
             np.where(whole, dimension, one),
         )
 
-    def lines(self, barred: np.ndarray) -> None:
-        """A line at each frequency but the barred."""
+    def lines(self) -> None:
+        """A line at each frequency."""
         assert self._scanner.lines is not None
-        own, spectrum, kind = self._cell.line, self._scanner.lines.spectrum, self._zy.dtype
-        cj, sj = spectrum(self._zj)
-        a11 = own[:, 0, 0] - np.sum(cj**2, axis=1)
-        a22 = own[:, 1, 1] - np.sum(sj**2, axis=1)
-        a12 = own[:, 0, 1] - np.sum(cj * sj, axis=1)
-        determinant = a11 * a22 - a12**2
-        keep = (determinant > 1e-3 * own[:, 0, 0] * own[:, 1, 1]) & (a11 > 0) & ~barred
-        # A line explains (along (c − lean s))² + (across s)².
-        a22, determinant = np.where(keep, a22, 1.0), np.where(keep, determinant, 1.0)
-        along, lean, across = (
-            np.where(keep, x, 0.0).astype(kind) for x in (np.sqrt(a22 / determinant), a12 / a22, a22**-0.5)
-        )
-        t = np.zeros((self._zy.shape[1], len(keep)), kind)
+        beside, spectrum = self._beside.lines, self._scanner.lines.spectrum
+        along, lean, across = (x.astype(self._zy.dtype) for x in (beside.along, beside.lean, beside.across))
+        t = np.zeros((self._zy.shape[1], len(along)), self._zy.dtype)
         c = s = t.T
         for i in range(0, len(t), SETS_TOGETHER):
             c, s = spectrum(self._zy[:, i : i + SETS_TOGETHER])
             t[i : i + SETS_TOGETHER] = (along * (c.T - lean * s.T)) ** 2 + (across * s.T) ** 2
-        if len(t) == 1:
-            worth = log_evidence_ratio(PEAK_SLACK * t.max(axis=1), self._rss, self._nu, 2) > np.log(len(keep))
+        if self._cross is not None and len(t) == 1:
+            worth = log_evidence_ratio(PEAK_SLACK * t.max(axis=1), self._rss, self._nu, 2) > np.log(len(along))
             if worth[0]:
-                self.batch.peaks = self._exact_peaks(t[0], np.column_stack([cj, c]), np.column_stack([sj, s]))
-        self._record("bias_periodic", np.arange(len(keep)), t.T, np.where(keep, a11, 0.0), 2)
+                both = np.column_stack([beside.cosine, c]), np.column_stack([beside.sine, s])
+                self.batch.peaks = self._exact_peaks(t[0], *both)
+        self._record("bias_periodic", np.arange(len(along)), t.T, beside.energy, 2)
 
     def _exact_peaks(self, t: np.ndarray, c: np.ndarray, s: np.ndarray) -> dict[int, float]:
         """Correct the statistic around the leading peaks, in place, by their exact energy; what each explains."""
@@ -229,7 +335,7 @@ class OneCell:
         if not len(peaks):
             return {}
         waves = self._scanner.lines.waves(np.resize(peaks, PEAKS))
-        w = self._scanner.cells.whiten(self._g, waves)
+        w = self._scanner.cells.whiten(self._beside.g, waves)
         pair = w.reshape(len(w), 2, PEAKS)[:, :, : len(peaks)]
         own = np.einsum("nik,njk->kij", pair, pair)
         cross = np.stack([c[peaks], s[peaks]], axis=1)
@@ -247,24 +353,31 @@ class OneCell:
             t[around] = np.minimum(before[around] * (exact / before[k] if before[k] > 0 else 0.0), exact)
         return {int(k): float(exact) for k, exact in zip(peaks, right, strict=True)}
 
-    def _single(self, name: str, where: np.ndarray, b: np.ndarray, own: np.ndarray, cross: np.ndarray) -> np.ndarray:
+    def _single(self, name: str, where: np.ndarray, b: np.ndarray, left: np.ndarray) -> np.ndarray:
         """Record one column anywhere; what it explains."""
-        left = own - np.sum(cross**2, axis=1)
-        keep = left > VANISHED * own
-        t = np.where(keep, 1.0 / np.where(keep, left, 1.0), 0.0).astype(b.dtype)[:, None] * b**2
-        self._record(name, where, t, np.where(keep, left, 0.0), 1)
+        t = np.where(left > 0, 1.0 / np.where(left > 0, left, 1.0), 0.0).astype(b.dtype)[:, None] * b**2
+        self._record(name, where, t, left, 1)
         return t
 
     def _record(self, name: str, where: np.ndarray, t: np.ndarray, energy: np.ndarray, q: int) -> None:
         """Record what q columns, which may stand anywhere, explain there."""
         if not len(where):
             return
-        batch = self.batch
-        top = np.argmax(np.minimum(t, self._rss), axis=0)
-        best = np.minimum(t[top, np.arange(len(top))], self._rss)
-        batch.evidence[name] = log_mean_evidence(t, self._rss, self._nu, q)
-        batch.best[name] = (list(where[top]), best, np.full(len(top), float(q)))
+        batch, rss = self.batch, self._rss
         batch.energy[name] = energy
+        if self._cross is None:
+            batch.evidence[name] = np.log(mean_evidence_of_draws(t, rss, self._nu, q))
+            return
+        batch.evidence[name] = log_mean(log_evidence_ratio(t, rss, self._nu, q))
+        top = np.argmax(np.minimum(t, rss), axis=0)
+        best = np.minimum(t[top, np.arange(len(top))], rss)
+        batch.best[name] = (list(where[top]), best, np.full(len(top), float(q)))
+
+
+def _left(own: np.ndarray, cross: np.ndarray) -> np.ndarray:
+    """Energy of single columns beside what they share with the baseline; 0 where nothing is left."""
+    left = own - np.sum(cross**2, axis=1)
+    return np.where(left > VANISHED * own, left, 0.0)
 
 
 def _gross(t: np.ndarray, where: np.ndarray, rss: float, nu: int) -> list[int]:

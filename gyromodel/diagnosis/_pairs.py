@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Container
 from itertools import combinations
 
 import numpy as np
 
+from gyromodel.diagnosis._bank import Bank, Block
 from gyromodel.diagnosis._evidence import log_evidence_ratio, log_sum
 from gyromodel.diagnosis._ranking import Ranking, is_driver
 from gyromodel.diagnosis._scan import Scanner
@@ -14,23 +16,27 @@ from gyromodel.diagnosis._tangents import VANISHED
 
 # Coefficients of each of the two, at most: what has more can follow what is left of any other.
 WIDEST = 2
+# So many forms of one structure are all tried.
+FEW_FORMS = 8
 
 
-def best_pair(scanner: Scanner, ranking: Ranking) -> tuple[tuple[str, str] | None, float]:
-    """The two effects with the most evidence together, the likelier one alone first, and the ln of their ratio.
+def best_pair(scanner: Scanner, ranking: Ranking, but: Container[str] = ()) -> tuple[tuple[str, str] | None, float]:
+    """The two effects, none of `but`, with the most evidence together, the likelier one alone first; and that (ln B).
 
-    Each stands at the form that is best alone; the choice of forms and of a partner is paid for.
+    Each stands at the form that is best alone, of each structure that it may have, or at any where they are few, as of
+    products of accelerations; the choice of forms and of a partner is paid for.
     """
     bank = scanner.bank
     forms = Counter(b.name for b in bank.blocks)
     names, blocks = [], []
     for name in sorted(ranking.statistic, key=lambda k: -ranking.statistic[k]):
-        if forms[name] and not is_driver(name):
+        if forms[name] and not is_driver(name) and name not in but:
             form = ranking.best_form(name)[0]
             if isinstance(form, int) and bank.blocks[form].width <= WIDEST:
-                names.append(name)
-                blocks.append(bank.blocks[form])
-    if len(names) < 2:
+                each = _forms(bank, ranking, name)
+                names += [name] * len(each)
+                blocks += each
+    if len(set(names)) < 2:
         return None, -np.inf
     columns = np.zeros((len(bank.columns), len(names), WIDEST))
     for i, b in enumerate(blocks):
@@ -38,9 +44,9 @@ def best_pair(scanner: Scanner, ranking: Ranking) -> tuple[tuple[str, str] | Non
     base, p = ranking.baseline_columns, ranking.baseline_columns.shape[1]
     data = np.column_stack([base, columns.reshape(len(columns), -1), ranking.residual])
     data = np.where(scanner.present[:, None], data, 0.0)
-    pairs = np.array(list(combinations(range(len(names)), 2)))
+    pairs = np.array([(i, j) for i, j in combinations(range(len(names)), 2) if names[i] != names[j]])
     each = np.array([np.log(forms[name]) + bank.price(name) for name in names])
-    price = np.log((len(names) - 1) / 2) + each[pairs].sum(axis=1)
+    price = np.log((len(set(names)) - 1) / 2) + each[pairs].sum(axis=1)
     nu = scanner.degrees_of_freedom - p
     by_cell = []
     for g, result in ranking.results.items():
@@ -51,6 +57,16 @@ def best_pair(scanner: Scanner, ranking: Ranking) -> tuple[tuple[str, str] | Non
     top = int(np.argmax(together))
     first, second = pairs[top]
     return (names[first], names[second]), float(together[top])
+
+
+def _forms(bank: Bank, ranking: Ranking, name: str) -> list[Block]:
+    """Forms of an effect that a pair may have."""
+    explained, of = ranking.results[ranking.best_cell(name)].explained, dict[str, list[int]]()
+    for i, block in enumerate(bank.blocks):
+        if block.name == name and block.width <= WIDEST:
+            of.setdefault(block.structure, []).append(i)
+    each = (forms if len(forms) <= FEW_FORMS else [max(forms, key=lambda i: explained[i])] for forms in of.values())
+    return [bank.blocks[i] for forms in each for i in forms]
 
 
 def _explained(w: np.ndarray, p: int, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -23,8 +23,9 @@ FEWEST_SAMPLES, FEWEST_DWELLS, MOST_APART = 4, 12, 0.2
 # Robust standard deviations from which on the mean of a dwell stands apart, and is suspected.
 APART, SUSPECT = 8.0, 4.0
 DWELLS_TOLD = 6
-# Fits through as few points as determine them: of so many, one is through good points only.
-FITS, FIRST_FITS, SOUND = 1000, 50, 1e-6
+# Fits through as few points as determine them: of so many, one is close to the good points. Of few parameters and fewer
+# anomalous points fewer do.
+FITS, DWELL_FITS, FEW_FITTED, FIRST_FITS, SOUND = 1000, 250, 3, 50, 1e-6
 
 
 def test_points(record: Record) -> list[np.ndarray]:
@@ -96,7 +97,13 @@ def levels(record: Record, points: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def suspects(
-    points: Sequence[np.ndarray], level: np.ndarray, columns: np.ndarray, residuals: np.ndarray, most: int, least: float
+    points: Sequence[np.ndarray],
+    level: np.ndarray,
+    columns: np.ndarray,
+    residuals: np.ndarray,
+    most: int,
+    least: float,
+    fits: int,
 ) -> list[np.ndarray]:
     """Of each residual, the most anomalous points in the order of a robust fit; none where none is so by `least`.
 
@@ -109,11 +116,12 @@ def suspects(
         residuals: one a column.
         most: how many at most.
         least: robust standard deviations of the first.
+        fits: see `robust_orders`.
     """
     if most < 1:
         return [np.zeros(0, int)] * residuals.shape[1]
     fitted, data = (np.stack([x[p].mean(axis=0) for p in points]) for x in (columns, residuals))
-    orders = robust_orders(fitted, data)
+    orders = robust_orders(fitted, data, fits)
     return [_not_returning(order[: most if score >= least else 0], level) for order, score in orders]
 
 
@@ -128,7 +136,7 @@ def _not_returning(order: np.ndarray, level: np.ndarray) -> np.ndarray:
     return order
 
 
-def robust_orders(columns: np.ndarray, data: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:
+def robust_orders(columns: np.ndarray, data: np.ndarray, fits: int) -> Iterator[tuple[np.ndarray, float]]:
     """Of each data set, points by how anomalous they are beside the fit of least median misfit; the first's misfit.
 
     Fits go through as few points as determine them: anomalous points cannot mask one another in one through good ones.
@@ -136,6 +144,7 @@ def robust_orders(columns: np.ndarray, data: np.ndarray) -> Iterator[tuple[np.nd
     Args:
         columns: what is fitted, at each point.
         data: at each point, one set a column.
+        fits: at most so many, at random.
 
     Yields:
         The points' numbers, none where they are too few, and the first's misfit in robust standard deviations.
@@ -146,10 +155,10 @@ def robust_orders(columns: np.ndarray, data: np.ndarray) -> Iterator[tuple[np.nd
     if n < 2 * p:
         yield from [(np.zeros(0, int), 0.0)] * data.shape[1]
         return
-    if comb(n, p) <= FITS:
+    if comb(n, p) <= fits:
         through = np.array(list(combinations(range(n), p)), int)
     else:
-        through = np.random.default_rng(0).integers(n, size=(FITS, p))
+        through = np.random.default_rng(0).integers(n, size=(fits, p))
     sound = np.abs(np.linalg.det(u[through]))
     through = through[sound >= SOUND * sound.max()]
     solved, half = np.linalg.inv(u[through]), p + (n - p) // 2

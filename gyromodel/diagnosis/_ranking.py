@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,8 @@ EXEMPT = (*SLOW_IN_TIME, "outliers")
 TIME_MARGIN = 15.0
 # Nats by which a cause that no catalogue lists must do better: it is rarer than one that does.
 UNLISTED = 1.0
+# Part of the largest direction of further columns from which on another counts, beyond the baseline's.
+SPANNED = 1e-4
 
 
 @dataclass(frozen=True)
@@ -182,13 +185,19 @@ def rank(
     pulses: tuple[int, ...],
     skip: set[str],
     known: dict[int, CellResult] | None = None,
+    beside: np.ndarray | None = None,
 ) -> Ranking:
-    """Rank every candidate against a fitted baseline; `pulses` are gross errors, `known` cells done before."""
+    """Rank every candidate against a fitted baseline.
+
+    `pulses` are gross errors, `known` cells done before, `beside` further columns that explain what they can.
+    """
     record = scanner.record
     predicted, jacobian = estimate.model.linearise(record.signals)
     gain = float(estimate.model.gain())
     residual = np.where(scanner.present, np.asarray(record.signals["output"] - predicted), 0.0) / gain
     columns = np.asarray(jacobian)
+    if beside is not None:
+        columns = np.column_stack([columns, beyond(beside, columns, scanner.present)])
     if pulses:
         marks = np.zeros((len(columns), len(pulses)))
         marks[list(pulses), np.arange(len(pulses))] = 1.0
@@ -271,17 +280,36 @@ def tangents(scanner: Scanner, model: GyroModel, skip: set[str]) -> dict[str, Ta
     return found
 
 
-def rank_where_it_matters(scanner: Scanner, estimate: Estimate, pulses: tuple[int, ...]) -> Ranking:
+def beyond(columns: np.ndarray, others: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Orthonormal columns of what some columns span beyond others where samples are; zero elsewhere."""
+    one, two = (x[present] / np.maximum(np.linalg.norm(x[present], axis=0), 1e-300) for x in (columns, others))
+    left = one - two @ np.linalg.lstsq(two, one, rcond=1e-10)[0]
+    basis, size, _ = np.linalg.svd(left, full_matrices=False)
+    basis = basis[:, size > SPANNED * size.max(initial=1.0)]
+    whole = np.zeros((len(columns), basis.shape[1]))
+    whole[present] = basis
+    return whole
+
+
+def rank_where_it_matters(
+    scanner: Scanner, estimate: Estimate, pulses: tuple[int, ...], beside: np.ndarray | None = None
+) -> Ranking:
     """Rank over the noise cells that matter: every other level, then neighbours of those with weight for any."""
-    skip = skipped(estimate.model, scanner.record.signals)
+    ranked = partial(
+        rank,
+        scanner,
+        estimate=estimate,
+        pulses=pulses,
+        skip=skipped(estimate.model, scanner.record.signals),
+        beside=beside,
+    )
     if scanner.stated:
-        cells = [0] if estimate.noise_given else scanner.only_cells or scanner.all_cells()
-        return rank(scanner, cells, estimate, pulses, skip)
+        return ranked([0] if estimate.noise_given else scanner.only_cells or scanner.all_cells())
     if scanner.only_cells is not None:
-        return rank(scanner, scanner.only_cells, estimate, pulses, skip)
-    ranking = rank(scanner, scanner.coarse_cells(), estimate, pulses, skip)
+        return ranked(scanner.only_cells)
+    ranking = ranked(scanner.coarse_cells())
     near = set(cells_of_weight(ranking, NEARBY))
-    return rank(scanner, scanner.neighbours(near), estimate, pulses, skip, ranking.results)
+    return ranked(scanner.neighbours(near), known=ranking.results)
 
 
 def cells_of_weight(ranking: Ranking, nats: float) -> list[int]:

@@ -71,13 +71,18 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Round:
-    """One step of the ladder: what was added, on what evidence, and the error on data it had not seen."""
+    """One step of the ladder: what was added, on what evidence, and the error on data not seen.
+
+    The first adds nothing. `ranking` is of what could be added next, beside all that was added so far, and beside any
+    function of the driver `beside` if there is one.
+    """
 
     added: str | None
     statistic: float
     ranking: tuple[Candidate, ...]
     held_out: float
     log_score: float
+    beside: str | None = None
 
 
 @dataclass(frozen=True)
@@ -99,9 +104,10 @@ class Gain:
 class Driver:
     """The smooth function of one column (or of time) that an unknown discrepancy follows, with its standard error.
 
-    `column` is a column a, d(a)/dt (its rate of change), a[earlier] (its value some time before) or rate[earlier] (the
-    root mean square of the rate some time before, which warms a torquer). `nearest` is the catalogue effect that comes
-    closest, `nearest_share` what part of the curve's work it does, `behind` by how many nats of evidence it is beaten.
+    `column` is a column a, d(a)/dt (its rate of change) or a[earlier] (its value some time before, of the rate its root
+    mean square, which warms a torquer); rate[behind] is the rate some time before, less the rate. `nearest` is the
+    catalogue effect that comes closest, `nearest_share` what part of the curve's work it does, `behind` by how many
+    nats of evidence it is beaten.
     """
 
     column: str

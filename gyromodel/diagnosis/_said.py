@@ -5,13 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from scipy.stats import binom
 
 from gyromodel._checks import listed
 from gyromodel.campaign import Campaign
+from gyromodel.diagnosis._drivers import RECOVERY_DRIVER
 from gyromodel.diagnosis._lines import lines_of
 from gyromodel.diagnosis._ranking import is_driver, special_cases
 from gyromodel.diagnosis._result import CREDIBLE, VAGUE
+from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import Selection
+from gyromodel.diagnosis._smooths import recoveries
 from gyromodel.diagnosis._steps import Found, Steps
 from gyromodel.effects import Effect
 from gyromodel.effects.drivers import BiasPeriodic, BiasStep
@@ -25,6 +29,10 @@ IRREGULAR = 0.01
 UNDER_EARTH = ("bias_acceleration_input", "bias_acceleration_output", "bias_acceleration_spin")
 # Gross errors that are listed by row.
 ROWS_TOLD = 12
+# By how much the lags searched are apart, within which one is known.
+BETWEEN_LAGS = 2.0**0.5
+# Chance below which they lie right after changes of the rate for a reason.
+BY_CHANCE = 1e-4
 
 
 def told(
@@ -33,13 +41,21 @@ def told(
     """Sentences on the extension as a whole, whatever the verdict; `edges`: samples on the other side of a step's."""
     what = "given up, as they may be at edges of steps" if edges else "given up, not modelled"
     yield from (f"{line}: {what}." for line in _given_up(steps, selection, searched))
+    yield from _after_changes(steps, selection)
     found = selection.found
     for one, other in zip(selection.path, selection.path[1:], strict=False):
-        if one.paired and {one.name, other.name} <= {step.name for step in found}:
+        names, alone = {one.name, other.name}, one.ranking
+        hardly = all(alone.statistic.get(name, -np.inf) < steps.least(alone, name) for name in names)
+        if one.paired and hardly and names <= {step.name for step in found}:
             yield (
                 f"{one.name} and {other.name} show together and hardly alone: much alike on this campaign, they all "
                 "but cancel."
             )
+    # Lines that are none are told of otherwise.
+    kept = {*(step.name for step in found), "bias_periodic"}
+    if found and (gone := [name for name in dict.fromkeys(f.name for f in selection.path) if name not in kept]):
+        were = "was" if len(gone) == 1 else "were"
+        yield f"{listed(gone)} {were} added on the way, and given up beside what was found."
     for step in (f for f in found if f.rows and not f.points):
         yield (
             f"{len(step.rows)} samples next to gaps or the record's ends were left out beside {step.name}: what was "
@@ -95,16 +111,53 @@ def _given_up(steps: Steps, selection: Selection, searched: Sequence[tuple[Campa
     """Dwells and single samples that no model holds; test points are told of as a cause."""
     if steps.scanner.by_points:
         return
-    given_up = sorted(row for step in selection.found for row in step.points)
-    dwells = steps.scanner.points_among(given_up)
+    dwells, errors = _dwells_and_errors(steps, selection)
     if dwells:
         what = f"{len(dwells)} whole dwells, which begin" if len(dwells) > 1 else "A whole dwell, which begins"
         yield f"{what} {places([int(d[0]) for d in dwells], searched)}"
-    of_dwells = {int(row) for dwell in dwells for row in dwell}
-    errors = [row for row in given_up if row not in of_dwells]
     if errors:
         what = f"{len(errors)} gross errors" if len(errors) > 1 else "A gross error"
         yield f"{what} {places(errors, searched)}"
+
+
+def _dwells_and_errors(steps: Steps, selection: Selection) -> tuple[list[np.ndarray], list[int]]:
+    """Rows of each whole dwell, and the single rows beside, that no model holds."""
+    given_up = sorted({row for step in selection.found for row in step.points})
+    dwells = steps.scanner.points_among(given_up)
+    of_dwells = {int(row) for dwell in dwells for row in dwell}
+    return dwells, [row for row in given_up if row not in of_dwells]
+
+
+def _after_changes(steps: Steps, selection: Selection) -> Iterator[str]:
+    """A sentence where gross errors are the first samples of new rates."""
+    scanner = steps.scanner
+    signals, rows = scanner.record.signals, scanner.record.rows
+    if scanner.by_points or "rate" not in signals:
+        return
+    changed = np.diff(np.asarray(signals["rate"])[:rows], prepend=np.asarray(signals["rate"])[0]) != 0
+    changed &= ~np.asarray(scanner.record.sampling.restart)[:rows]
+    _, errors = _dwells_and_errors(steps, selection)
+    on = int(changed[errors].sum())
+    if on and binom.sf(on - 1, len(errors), changed.mean()) < BY_CHANCE:
+        yield (
+            f"{on} of {len(errors)} gross errors are the first sample after a change of the rate: the gyro's or the "
+            "reference's delay."
+        )
+
+
+def told_of_driver(scanner: Scanner, selection: Selection, driver: str) -> Iterator[str]:
+    """The time constant of what follows the rate through a lag."""
+    if driver != RECOVERY_DRIVER:
+        return
+    along = scanner.bank.blocks[int(np.asarray(selection.last.best_form(driver)[0]))].along
+    assert along is not None
+    for lag in (lag for lag, late in recoveries(scanner.record) if np.array_equal(late, along)):
+        yield (
+            "After each change of the rate the error recovers in proportion to it, with a time constant of some "
+            f"{lag / BETWEEN_LAGS:.2g} to {lag * BETWEEN_LAGS:.2g} s."
+        )
+        if lag < scanner.record.interval:
+            yield "That is less than a sample: the times of gyro and reference may be apart."
 
 
 def _in_campaign(effect: Effect | None) -> str:
@@ -112,6 +165,9 @@ def _in_campaign(effect: Effect | None) -> str:
     if isinstance(effect, BiasStep) and effect.campaign:
         return f"The step found is in campaign {effect.campaign}."
     if isinstance(effect, BiasPeriodic) and effect.campaigns:
+        if len(set(effect.campaigns)) == 1:
+            lines = "line found is" if len(effect.campaigns) == 1 else "lines found are"
+            return f"The {lines} in campaign {effect.campaigns[0]}."
         return f"The lines found are in campaigns {', '.join(map(str, effect.campaigns))}, in this order."
     return ""
 
@@ -126,7 +182,11 @@ def _aliases(estimate: Estimate) -> str:
     sampled = 1.0 / record.interval
     lines = sorted({line.frequency for line in lines_of(estimate.model)})
     each = [f"{f:.4g} Hz ({sampled - f:.4g}, {sampled + f:.4g} Hz, …)" for f in lines]
-    return f"Rows every {record.interval:.4g} s cannot tell a line from its aliases: {listed(each)}."
+    told = f"every {record.interval:.4g} s cannot tell a line from its aliases: {listed(each)}"
+    if "_averaged" not in record.signals or np.asarray(record.signals["_averaged"]).max() < 2:
+        return f"Rows {told}."
+    seen = 0.5 / float(np.median(np.asarray(record.signals["_step"])[: record.rows]))
+    return f"Means {told}; the rows that they are of tell those below {seen:.4g} Hz apart."
 
 
 def _moved(estimate: Estimate, other: Estimate | None) -> str:

@@ -18,14 +18,27 @@ from threadpoolctl import ThreadpoolController
 from gyromodel.diagnosis._bank import Bank, BlockTable
 from gyromodel.diagnosis._batch import Batch, CellResult
 from gyromodel.diagnosis._cells import Cells
+from gyromodel.diagnosis._evidence import FEW_SETS
 from gyromodel.diagnosis._lines import Line, line_grid
-from gyromodel.diagnosis._one_cell import OneCell
-from gyromodel.diagnosis._points import MOST_APART, MOST_POINTS, SUSPECT, levels, suspects, test_points
+from gyromodel.diagnosis._one_cell import Beside, OneCell
+from gyromodel.diagnosis._points import (
+    DWELL_FITS,
+    FEW_FITTED,
+    FITS,
+    MOST_APART,
+    MOST_POINTS,
+    SUSPECT,
+    levels,
+    suspects,
+    test_points,
+)
 from gyromodel.diagnosis._tangents import Tangent, add_tangents
 from gyromodel.noise import NoiseGrid
 from gyromodel.signals import Record
 
 THREADS = 2
+# Draws worked out at once, more of short records, whose values stay within so many.
+LEAST_TOGETHER, MOST_TOGETHER, VALUES_TOGETHER = 64, 256, 2**18
 # A form with less than this part of its energy in the rows kept was told by those left out.
 LOST = 1e-6
 
@@ -175,33 +188,58 @@ class Scanner:
         # Once: of what several sets leave, the rest of a curve would be the next.
         points = [] if self.points_among(given_up) else self.points
         most = int(len(points) * (MOST_POINTS if self.by_points else MOST_APART))
-        least_score = 0.0 if self.by_points else SUSPECT
-        orders = suspects(
-            points, levels(self.record, points), jacobian[:, : p - len(given_up)], residuals, most, least_score
-        )
+        least_score, few = 0.0 if self.by_points else SUSPECT, p - len(given_up) <= FEW_FITTED and not self.by_points
+        fitted, fits = jacobian[:, : p - len(given_up)], DWELL_FITS if few else FITS
+        orders = suspects(points, levels(self.record, points), fitted, residuals, most, least_score, fits)
+        among = np.unique(np.concatenate(orders))
+        suspected, orders = [points[k] for k in among], [np.searchsorted(among, order) for order in orders]
+
+        exact, data, nu = stacked[:, : first + p], stacked[:, first + p :], self.degrees_of_freedom - p
+
+        def beside(g: int, z: np.ndarray, cross: np.ndarray) -> Beside:
+            both = slice(first, first + p)
+            return Beside(self, g, exact[:, both], z[:, both], cross[:, both], barred, suspected)
 
         def search(group: Sequence[int]) -> list[Batch]:
-            batches = []
-            for g, products in zip(group, self.cells.inner_products(group, stacked, first + p), strict=True):
-                one = OneCell(self, g, stacked, products, first, p)
-                one.blocks(least, self._lost)
-                if self.steps:
-                    one.steps()
-                if self.outliers and not self.by_points:
-                    one.gross_errors(np.flatnonzero(self.present[: self.record.rows]))
-                if self.outliers and any(map(len, orders)):
-                    one.anomalous_points(points, orders)
-                if self.lines:
-                    one.lines(barred)
-                add_tangents(one.batch, tangents, stacked, products.z, p, self.degrees_of_freedom - p)
-                batches.append(one.batch)
-            return batches
+            found = []
+            for g, (z, cross) in zip(group, self.cells.inner_products(group, stacked), strict=True):
+                one = OneCell(beside(g, z, cross), data, z[:, first + p :], cross[:, first + p :])
+                found.append(self._searched(one, least, len(points), orders))
+                add_tangents(found[-1], tangents, stacked, z, p, nu)
+            return found
 
+        def search_draws(group: Sequence[int]) -> list[Batch]:
+            [g], found = group, []
+            z = self.cells.precision(g, exact)
+            baseline = beside(g, z, self.bank.columns.T @ z)
+            together = min(max(VALUES_TOGETHER // len(data), LEAST_TOGETHER), MOST_TOGETHER)
+            for i in range(0, data.shape[1], together):
+                y = data[:, i : i + together]
+                own = self.cells.precision(g, y)
+                one = OneCell(baseline, y, own, None)
+                found.append(self._searched(one, least, len(points), orders[i : i + together]))
+                add_tangents(found[-1], tangents, np.hstack([exact, y]), np.hstack([z, own]), p, nu)
+            return [Batch.joined(found)]
+
+        many = data.shape[1] > FEW_SETS
         # Cells share the cores; BLAS threads on top of them would only wait for one another.
         with _libraries().limit(limits=1, user_api="blas"), ThreadPoolExecutor(THREADS) as pool:
             self.cells.prepare(cells, pool.map)
-            groups = self.cells.groups(cells, stacked.shape[1])
-            return [batch for group in pool.map(search, groups) for batch in group]
+            groups = [[g] for g in cells] if many else self.cells.groups(cells, stacked.shape[1])
+            return [batch for group in pool.map(search_draws if many else search, groups) for batch in group]
+
+    def _searched(self, one: OneCell, least: np.ndarray, points: int, orders: Sequence[np.ndarray]) -> Batch:
+        """What one cell says of every candidate."""
+        one.blocks(least, self._lost)
+        if self.steps:
+            one.steps()
+        if self.outliers and not self.by_points:
+            one.gross_errors(np.flatnonzero(self.present[: self.record.rows]))
+        if self.outliers and any(map(len, orders)):
+            one.anomalous_points(points, orders)
+        if self.lines:
+            one.lines()
+        return one.batch
 
     def to_run_end(self, onwards: np.ndarray) -> np.ndarray:
         """Of sums from each sample to the last, those from each epoch to the end of its run."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.stats import rankdata
 
 from gyromodel.declarations import measured
 from gyromodel.diagnosis._apart import like
@@ -15,8 +16,9 @@ from gyromodel.diagnosis._exchange import DOUBT, SLOW_LEAD, exchanged, steady, u
 from gyromodel.diagnosis._forms import MAXIMUM_LINES
 from gyromodel.diagnosis._lines import lines_of
 from gyromodel.diagnosis._pairs import best_pair
-from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, evidence_in, rank, skipped
-from gyromodel.diagnosis._steps import EXCHANGE, Found, Steps, rows_of, standing
+from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, evidence_in, is_noise, rank, skipped
+from gyromodel.diagnosis._scan import Scanner
+from gyromodel.diagnosis._steps import BETWEEN, EXCHANGE, Found, Steps, rows_of, standing
 from gyromodel.estimate import Estimate
 
 Progress = Callable[[str, float], None] | None
@@ -24,6 +26,12 @@ Progress = Callable[[str, float], None] | None
 MAXIMUM_ROUNDS = 12
 # More steps than this are a function of time that nobody explains by naming each.
 MAXIMUM_STEPS = 3
+# Columns of a driver's functions that are taken out beside names, as a part of the samples.
+MOST_TAKEN = 0.25
+# Rank correlation with time from which on a column goes one way.
+ONE_WAY = 0.95
+# Powers of a driver's values that are taken out beside names.
+POWERS = 3
 # Nats that a further cause needs more than the first: of something wrong one cause is likelier than two.
 FURTHER = 1.0
 
@@ -34,7 +42,7 @@ class Selection:
 
     `left_out` holds rankings beside everything found except one, where the search has made them; `remains` names what
     was still significant and not added, `beside_it` is the fit with it where there is one, and `unresolved` says why if
-    it is too small.
+    it is too small. `alone` is the ranking beside the simulation where the path begins beside a driver's function.
     """
 
     estimate: Estimate
@@ -47,6 +55,12 @@ class Selection:
     remains: str = ""
     unresolved: str = ""
     beside_it: Estimate | None = field(default=None, repr=False)
+    alone: Ranking | None = field(default=None, repr=False)
+
+    @property
+    def first(self) -> Ranking:
+        """All candidates beside the simulation as it was given."""
+        return self.alone or (self.path[0].ranking if self.path else self.last)
 
     @property
     def unfinished(self) -> bool:
@@ -59,14 +73,18 @@ class Selection:
         return self.last.statistic[self.driver] if self.driver else 0.0
 
 
-def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selection:
-    """Add candidates until nothing more is significant.
+def search(steps: Steps, progress: Progress = None) -> Selection:
+    """Add candidates until nothing more is significant, beside what is followed without a name too.
 
     Args:
         steps: the data, the simulation and the threshold.
         progress: called with a line and the fraction done.
-        avoid: a name that is not to be the first.
     """
+    return steadied(steps, _beside_driver(steps, steadied(steps, _rounds(steps, progress))))
+
+
+def _rounds(steps: Steps, progress: Progress, avoid: str = "") -> Selection:
+    """Add candidates until nothing more is significant; `avoid` is not to be the first."""
     scanner, threshold = steps.scanner, steps.threshold
     path: list[Found] = []
     lost: set[str] = set()
@@ -82,19 +100,22 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
         for more in (f.name for f in path if f.grows and f.name not in lost):
             if ranking.statistic.get(more, -np.inf) > score - DOUBT:
                 name, score = more, ranking.statistic[more]
-        if name is None or not _significant(steps, ranking, name, score - FURTHER * bool(path)):
-            both = _together(steps, path, estimate, ranking)
-            if not both or len(path) + 2 > MAXIMUM_ROUNDS or any(unresolved(e, f, scanner.step) for f, e in both):
-                break
-            path += [step for step, _ in both]
-            estimates += [after for _, after in both]
-            continue
+        shows = name is not None and _significant(steps, ranking, name, score - FURTHER * bool(path))
+        if not shows or not path:
+            # Alone none may show, or what shows may stand for two.
+            both = _together(steps, path, estimate, ranking, name if shows else None, barred)
+            if both and len(path) + 2 <= MAXIMUM_ROUNDS and not any(unresolved(e, f, scanner.step) for f, e in both):
+                path += [step for step, _ in both]
+                estimates += [after for _, after in both]
+                continue
+        if name is None or not shows:
+            break
         if len(path) >= MAXIMUM_ROUNDS:
             remains = name
             break
         jumps = [i for i, f in enumerate(path) if f.name == "bias_step"]
         if name == "bias_step" and len(jumps) >= MAXIMUM_STEPS:
-            return steadied(steps, _before(jumps[0], path, estimates))
+            return _before(jumps[0], path, estimates)
         step, after = steps.add(path, steps.step(path, estimate, ranking, name))
         small = unresolved(after, step, scanner.step) if after is not None else ""
         if after is None or small:
@@ -118,17 +139,16 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
         # back behind one that follows several of them.
         own, first = {measured(column)[0] for column in smooth_columns(str(driver))}, path[0].effect
         if not avoid and first is not None and not own >= set(first.columns_needed):
-            other = search(steps, progress, path[0].name)
+            other = steadied(steps, _rounds(steps, progress, path[0].name))
             if other.found:
                 return other
         return Selection(steps.baseline, (), (), path[0].ranking, (steps.baseline,), driver)
     for i in range(1, len(path)):
         if not path[i - 1].paired and (driver := _ahead_of(path[i:], threshold)):
             before, ranking = path[:i], path[i].ranking
-            selection = Selection(
+            return Selection(
                 estimates[i], tuple(standing(before)), tuple(before), ranking, tuple(estimates[: i + 1]), driver
             )
-            return steadied(steps, selection)
     found, left_out = standing(path), {}
     if sum(f.weighed for f in found) > 1:
         before = found
@@ -142,10 +162,9 @@ def search(steps: Steps, progress: Progress = None, avoid: str = "") -> Selectio
     there = {name: score for name, score in there.items() if _significant(steps, ranking, name, score)}
     remains = remains or max(there, key=lambda name: there[name], default="")
     driver = significant_driver(ranking, threshold)
-    selection = Selection(
+    return Selection(
         estimates[-1], tuple(found), tuple(path), ranking, tuple(estimates), driver, left_out, remains, small
     )
-    return steadied(steps, selection)
 
 
 def steadied(steps: Steps, selection: Selection) -> Selection:
@@ -205,10 +224,17 @@ def _lead(steps: Steps, driver: str, path: list[Found], last: Ranking) -> float:
     return together if unknown else max(lead, together)
 
 
-def _together(steps: Steps, path: list[Found], estimate: Estimate, ranking: Ranking) -> list[tuple[Found, Estimate]]:
-    """Two candidates that are significant together where none is alone, with their fits; none: there are no such."""
-    pair, score = best_pair(steps.scanner, ranking)
+def _together(
+    steps: Steps, path: list[Found], estimate: Estimate, ranking: Ranking, alone: str | None, barred: Container[str]
+) -> list[tuple[Found, Estimate]]:
+    """Two candidates, none barred, that are significant together, with their fits; none: there are no such.
+
+    Where another is significant alone, the two are to do better than it by the odds of a further cause.
+    """
+    pair, score = best_pair(steps.scanner, ranking, barred)
     if pair is None or score < max(steps.least(ranking, name) for name in pair):
+        return []
+    if alone and (alone in pair or score < ranking.statistic[alone] + FURTHER):
         return []
     one = replace(steps.step(path, estimate, ranking, pair[0]), paired=True)
     first = steps.fit(standing([*path, one]))
@@ -226,6 +252,104 @@ def significant_driver(ranking: Ranking, threshold: float) -> str | None:
     """The leading smooth driver, if it is significant."""
     driver, score = ranking.best(drivers=True)
     return driver if driver and score >= threshold + ranking.more_needed(driver) else None
+
+
+def _beside_driver(steps: Steps, selection: Selection) -> Selection:
+    """The search of a gyro gone on beside whatever function there is of its driver, which hides what is smaller.
+
+    Names need as much more than else as a function may leave of what it explains, and are added once.
+    """
+    driver, scanner = selection.driver, steps.scanner
+    if driver is None or scanner.record.domain != "gyro":
+        return selection
+    # Many steps are a function of time; which test points are right must be settled first.
+    if selection.remains == "bias_step" or (scanner.by_points and any(f.points for f in selection.found)):
+        return selection
+    columns = _any_function(steps, selection.last, driver)
+    if columns.shape[1] > MOST_TAKEN * scanner.degrees_of_freedom:
+        return selection
+    # As a further cause, and as the functions may leave.
+    more = FURTHER + BETWEEN * selection.last.statistic[driver]
+    # What a function leaves of what changes once is no step, nor a kind of noise.
+    slow = (*SLOW_IN_TIME, "bias_periodic") if _once(scanner, driver) else ()
+    # Lines that are not steady were told of.
+    dropped = {f.name for f in selection.path} - {f.name for f in selection.found}
+    barred = ("outliers", *slow, *dropped)
+    found, path, estimates = list(selection.found), list(selection.path), list(selection.estimates)
+    estimates[-1] = selection.estimate
+    while len(path) < MAXIMUM_ROUNDS:
+        ranking = steps.rank_beside(estimates[-1], found, columns)
+        noises = (k for k in ranking.statistic if is_noise(k))
+        name, score = ranking.best(drivers=False, but=(*barred, *noises, *(f.name for f in found)))
+        if name is None or not score >= steps.least(ranking, name) + more:
+            break
+        step = replace(steps.step(found, estimates[-1], ranking, name), beside=driver, more=more)
+        step, after = steps.add(found, step)
+        if after is None or unresolved(after, step, scanner.step):
+            break
+        found, path, estimates = standing([*found, step]), [*path, step], [*estimates, after]
+    if len(path) == len(selection.path):
+        return selection
+    last = steps.rank(estimates[-1], found)
+    if significant_driver(last, steps.threshold) != driver:
+        return selection
+    as_before = found[: len(selection.found)] == list(selection.found)
+    left_out = dict(selection.left_out) if as_before else {}
+    for i in [i for i, f in enumerate(found) if f.beside and len(found) > 1]:
+        rest = [*found[:i], *found[i + 1 :]]
+        fitted = steps.fit(rest)
+        left_out[i] = steps.rank_beside(fitted, rest, columns) if fitted else found[i].ranking
+    return replace(
+        selection,
+        estimate=estimates[-1],
+        found=tuple(found),
+        path=tuple(path),
+        last=last,
+        estimates=tuple(estimates),
+        left_out=left_out,
+        remains="" if selection.remains in {f.name for f in found if f.beside} else selection.remains,
+        alone=selection.first,
+    )
+
+
+def _once(scanner: Scanner, driver: str) -> bool:
+    """Whether one of a driver's columns is time, or goes one way in every run."""
+    rows, names = slice(scanner.record.rows), smooth_columns(driver)
+    time, present, run = (
+        np.asarray(scanner.record.signals["time"])[rows],
+        scanner.present[rows],
+        scanner.record.run[rows],
+    )
+
+    def one_way(values: np.ndarray) -> bool:
+        seen = present & np.isfinite(values)
+        parts = [seen & (run == r) for r in np.unique(run[seen])]
+        each = (np.corrcoef(rankdata(time[p]), rankdata(values[p]))[0, 1] for p in parts if p.sum() > 2)
+        return all(abs(correlation) > ONE_WAY for correlation in each)
+
+    alone = {f"smooth({name})" for name in names}
+    values = {b.name: np.asarray(b.along)[rows] for b in scanner.bank.blocks if b.name in alone and b.along is not None}
+    return "time" in names or any(map(one_way, values.values()))
+
+
+def _any_function(steps: Steps, ranking: Ranking, driver: str) -> np.ndarray:
+    """Columns of a driver's best form, of the finest of the same values, and the values' first powers.
+
+    The finest leaves a part of a straight line, which large fringes would make a name.
+    """
+    bank = steps.scanner.bank
+    form, _, _ = ranking.best_form(driver)
+    assert isinstance(form, int)
+    best = bank.blocks[form]
+    assert best.along is not None
+    own = [(b, b.along) for b in bank.blocks if b.name == driver and b.along is not None]
+    finest = max((b for b, values in own if np.array_equal(values, best.along)), key=lambda b: b.width)
+    blocks = {b.start: b for b in (best, finest)}
+    along = np.pad(best.along, (0, len(bank.columns) - len(best.along)), mode="edge")
+    known = steps.scanner.present & np.isfinite(along)
+    along = np.where(known, along - along[known].mean(), 0.0)
+    powers = (along / np.abs(along).max())[:, None] ** np.arange(1, POWERS + 1)
+    return np.column_stack([*(bank.columns[:, b.start : b.start + b.width] for b in blocks.values()), powers])
 
 
 def _before(i: int, path: list[Found], estimates: list[Estimate]) -> Selection:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Array, Float
 
 from gyromodel._checks import CampaignError, thermometers
 from gyromodel.campaign import Campaign
@@ -17,7 +18,7 @@ from gyromodel.diagnosis._misfit import unexplained_axes
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import Progress, Selection, search, significant_driver, steadied
 from gyromodel.diagnosis._steps import EXCHANGE, NoisePath, Steps, standing
-from gyromodel.diagnosis._variance import with_variance
+from gyromodel.diagnosis._variance import Growth, with_variance
 from gyromodel.estimate import Estimate, EstimateError, Unrounded, fit_record
 from gyromodel.model import GyroModel
 from gyromodel.noise import NoiseGrid, NoiseRatios, noise_grid
@@ -50,30 +51,44 @@ class Session:
         return search(replace(self.steps, noise=noise), progress)
 
     def pruned(self, selection: Selection) -> Selection:
-        """The rounds, cut where (after the first step) the error on blocks left out stops falling."""
-        for i in range(2, len(selection.estimates)):
+        """The rounds, cut where (after the first step) the error on blocks left out stops falling for good."""
+        estimates = selection.estimates
+        for i in range(2, len(estimates)):
             # Two that show only together are judged together.
             step, first = selection.path[i - 1], i - 1 - selection.path[i - 2].paired
-            now, before = self.ladder(selection.estimates[i]), self.ladder(selection.estimates[first])
-            if first and not step.paired and step.effect is not None and now[0] > before[0] and now[1] < before[1]:
-                path, estimates = selection.path[:first], selection.estimates[: first + 1]
-                found, ranking = tuple(standing(path)), step.ranking
+            if not first or step.paired or step.effect is None:
+                continue
+            if rises_for_good(*(self.ladder(e)[:2] for e in (estimates[first], *estimates[i:]))):
+                path, kept = selection.path[:first], estimates[: first + 1]
+                found = tuple(standing(path))
+                ranking = self.steps.rank(kept[-1], found) if step.beside else step.ranking
                 # What was cut may have stood for a driver that was ahead of it.
                 driver = significant_driver(ranking, self.threshold)
                 if driver and ranking.statistic[driver] < ranking.statistic[step.name] + EXCHANGE:
                     driver = None
                 cut = Selection(
-                    estimates[-1],
+                    kept[-1],
                     found,
                     path,
                     ranking,
-                    estimates,
+                    kept,
                     driver,
                     remains=step.name,
-                    beside_it=selection.estimates[i],
+                    beside_it=estimates[i],
+                    alone=selection.alone,
                 )
                 return steadied(self.steps, cut)
         return selection
+
+
+def rises_for_good(before: tuple[float, float], *after: tuple[float, float]) -> bool:
+    """Whether held-out errors rise, and log scores fall, at the next of some rounds and all that follow.
+
+    What stands in for two for a while may make it worse until the second is there. A round that some block alone
+    determines has no error, and decides nothing.
+    """
+    known = [later for later in after if np.isfinite(later[0])]
+    return bool(np.isfinite(after[0][0])) and all(rms > before[0] and score < before[1] for rms, score in known)
 
 
 def laid_out(
@@ -146,6 +161,35 @@ def over_unrounded(
         return None
 
 
+def over_power_cycles(
+    session: Session, selection: Selection, time_on: Float[Array, " sample"], model: GyroModel, say: Progress
+) -> tuple[Session, Selection] | None:
+    """The search as if the gyro had been off in every gap, where a warm-up after each explains the data better.
+
+    Args:
+        session: the search as if it never had been.
+        selection: what that found.
+        time_on: time since each gap.
+        model: the simulation.
+        say: progress.
+    """
+    record = session.record._replace(signals=session.record.signals | {"time_on": time_on})
+    try:
+        off = laid_out(
+            record, model, session.threshold, outliers=session.scanner.outliers, start=_counted(session.baseline)
+        )
+    except EstimateError:
+        return None
+    # Nothing else asks when the gyro was turned on.
+    warms = "bias_warmup" in model.labels
+    if not warms and off.steps.rank(off.baseline, []).statistic.get("bias_warmup", -np.inf) < off.threshold:
+        return None
+    other = off.run(say)
+    warms = warms or any(f.name == "bias_warmup" for f in other.found)
+    ahead = EXCHANGE + selection.followed - other.followed
+    return (off, other) if warms and off.steps.fits_better(other.found, selection.found, ahead, session.steps) else None
+
+
 def over_smooth_thermometers(
     session: Session, selection: Selection, model: GyroModel, say: Progress
 ) -> tuple[Session, Selection] | None:
@@ -177,7 +221,7 @@ def _lost_to_thermometers(session: Session, smooth: Record, selection: Selection
     for estimate in (session.baseline, selection.estimate):
         before, after = (np.asarray(estimate.model.predict(r.signals))[: r.rows][here] for r in (measured, smooth))
         lost.append(0.5 * float(np.sum((after - before) ** 2)) / estimate.white_variance)
-    first = selection.path[0].ranking if selection.path else selection.last
+    first = selection.first
     for name in thermometers(measured.signals):
         before, after = (np.asarray(r.signals[name])[: r.rows][here] for r in (measured, smooth))
         share = np.var(after - before) / max(np.var(before), np.finfo(float).tiny)
@@ -200,11 +244,12 @@ def without_axis(
     return (data, session, selection) if explained else None
 
 
-def over_weighted(
-    session: Session, white: np.ndarray, model: GyroModel, say: Progress
-) -> tuple[Session, Selection] | None:
-    """The search of samples weighted by their noise levels, where it leaves no structure that passes for a level."""
-    record, scanner = with_variance(session.record, white), session.scanner
+def over_weighted(session: Session, grows: Growth, model: GyroModel, say: Progress) -> tuple[Session, Selection] | None:
+    """The search of samples weighted by their noise levels, where it leaves no structure that passes for a level.
+
+    What little may be left where samples count least cannot, where the level is much more certain.
+    """
+    record, scanner = with_variance(session.record, grows.white), session.scanner
     try:
         baseline = fit_record(record, model, start=_counted(session.baseline))
     except EstimateError:
@@ -213,7 +258,8 @@ def over_weighted(
     weighted = Scanner(record, scanner.bank, _grid(record, baseline), **kept)
     again = Session(weighted, baseline, session.threshold)
     selection = again.run(say)
-    return None if selection.unfinished else (again, selection)
+    passes = selection.remains or max(grows.ratio, 1.0 / grows.ratio) * selection.followed >= grows.evidence
+    return None if selection.unfinished and passes else (again, selection)
 
 
 def _counted(baseline: Estimate) -> NoiseRatios | None:

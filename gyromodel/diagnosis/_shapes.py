@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 import numpy as np
 
+from gyromodel._model_units import parameter_unit
 from gyromodel.diagnosis._apart import columns_of_best
 from gyromodel.diagnosis._bank import PART_OF
 from gyromodel.diagnosis._drivers import driver_unit, smooth_columns
@@ -17,7 +19,7 @@ from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import Selection
 from gyromodel.effects import Effect
 from gyromodel.estimate import Estimate
-from gyromodel.model import GyroModel, parameter_unit
+from gyromodel.model import GyroModel
 from gyromodel.units import factor, from_internal, internal_unit
 
 # Standard deviations by which a size has to exceed the least that is told to be told in 80 % of campaigns.
@@ -105,14 +107,26 @@ def _nearest(ranking: Ranking, driver: str, explained: float) -> tuple[str, floa
     return name, float(min(share, 1.0)), float(behind)
 
 
-def minimum_detectable(scanner: Scanner, ranking: Ranking, threshold: float, unit: str) -> dict[str, tuple[float, str]]:
+def minimum_detectable(
+    scanner: Scanner, last: Ranking, added: Mapping[str, Ranking], threshold: float, unit: str
+) -> dict[str, tuple[float, str]]:
     """Size of each searched effect that would have been found with 80 % probability, at the noise of the final fit.
 
     Those are left out that too few samples show at no size.
+
+    Args:
+        scanner: of the search.
+        last: beside all that was found.
+        added: of what was found and what is alike, the ranking in which it was: of more of it, `last` tells.
+        threshold: least ln B of an addition.
+        unit: of rates.
     """
     sizes: dict[str, tuple[float, str]] = {}
     widths = {b.name: b for b in reversed(scanner.bank.blocks)}
-    for name, energy in ranking.results[ranking.best_cell()].energy.items():
+    beside = dict.fromkeys(last.results[last.best_cell()].energy, last)
+    beside |= {name: _in_noise_of(last, ranking) for name, ranking in added.items()}
+    for name, ranking in beside.items():
+        energy = ranking.results[ranking.best_cell()].energy.get(name, np.zeros(1))
         if not _is_sized(name, energy):
             continue
         q = widths[name].width if name in widths else (2 if name == "bias_periodic" else 1)
@@ -130,6 +144,18 @@ def minimum_detectable(scanner: Scanner, ranking: Ranking, threshold: float, uni
             continue
         sizes[name] = _in_unit(scanner, name, widths[name].effect if name in widths else None, q, size, unit)
     return sizes
+
+
+def _in_noise_of(last: Ranking, ranking: Ranking) -> Ranking:
+    """An earlier ranking in the noise of the last one: what was missing is no noise.
+
+    As it was where it did not look at the noise that is likeliest now.
+    """
+    both = last.results.keys() & ranking.results.keys()
+    if last.best_cell() not in both:
+        return ranking
+    results = {g: replace(last.results[g], energy=ranking.results[g].energy) for g in sorted(both)}
+    return replace(ranking, results=results)
 
 
 def _is_sized(name: str, energy: np.ndarray) -> bool:
@@ -199,6 +225,6 @@ def not_testable(scanner: Scanner, ranking: Ranking, model: GyroModel, sized: It
     reasons |= dict.fromkeys(seen, "too few samples: no size of it would be told")
     return reasons | {
         name: "cannot be told from what the model already has on this campaign"
-        for name in tried - skipped(model, scanner.record.signals)
+        for name in tried - skipped(model, scanner.record.signals) - set(sized)
         if name not in result.evidence and not (result.energy.get(name, np.zeros(1)) > 0).any()
     }

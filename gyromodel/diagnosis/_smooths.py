@@ -8,7 +8,9 @@ from itertools import combinations
 import numpy as np
 
 from gyromodel.declarations import EARLIER, RATE_OF
-from gyromodel.diagnosis._drivers import RESPONSE_DRIVER, driver_names, kind_of
+from gyromodel.diagnosis._drivers import RECOVERY_DRIVER, RESPONSE_DRIVER, driver_names, kind_of
+from gyromodel.effects._shapes import beyond_earth
+from gyromodel.effects.dynamics import resolved
 from gyromodel.signals import Record, thermometer_rate
 from gyromodel.units import is_angle
 
@@ -38,6 +40,10 @@ SLOW, LAGS = 0.05, tuple(0.01 * 2.0 ** (k / 2) for k in range(9))
 # Samples before and after, whose rates stand for a linear response of any form (those after for its smooth part at the
 # ends of a run), and the least part of steps at which rates move.
 RESPONSE, MOVING = (13, 5, 2, 1, -1, -2), 0.5
+# A rate is held in steps if its changes from row to row have this part of its variance or less in mean square: rates
+# in random order that are held for four rows each have a half. The shortest lag of what follows it, in samples, is felt
+# in the first after each step alone.
+HELD, SHORTEST = 0.45, 0.25
 
 
 def smooths(record: Record) -> Iterator[Smooth]:
@@ -47,6 +53,7 @@ def smooths(record: Record) -> Iterator[Smooth]:
     if record.domain == "gyro" and "rate" in names:
         yield from _response(record)
         yield from _heated(record)
+        yield from ((RECOVERY_DRIVER, late, late[:, None]) for _, late in recoveries(record))
     for name in (n for n in names if n not in ("rate", "campaign") and _slow(record, n)):
         if not is_angle(record.units[name]):  # it may wrap round, which is no rate of change; its harmonics have names
             if name in names[:SWEPT]:
@@ -187,6 +194,24 @@ def _heated(record: Record) -> Iterator[Smooth]:
         return
     for power in (np.pad(p, extra, mode="edge") for p in powers):
         yield f"smooth({EARLIER.format('rate')})", np.sqrt(power), _product(record, power)
+
+
+def recoveries(record: Record) -> Iterator[tuple[float, np.ndarray]]:
+    """Time constants, and how far what follows the rate through such a lag is behind it, where rates are held in steps.
+
+    None where the rate is known between samples: a lag has a name there.
+    """
+    runs, extra = _runs(record), (0, len(record.signals["time"]) - record.rows)
+    time, rate = (np.asarray(record.signals[n])[: record.rows] for n in ("time", "rate"))
+    steps = np.concatenate([np.diff(rate[rows]) for rows in runs])
+    held = 0.0 < np.mean(steps**2) <= HELD * np.var(rate) if len(steps) else False
+    if not held or resolved(record.signals) or not beyond_earth(record.signals):
+        return
+    lag, longest = SHORTEST * record.interval, _lags(time, runs)[-1]
+    while lag < longest:
+        late = np.concatenate([_followed(time[rows], rate[rows], lag) for rows in runs])
+        yield lag, np.pad(late - rate, extra, mode="edge")
+        lag *= np.sqrt(2.0)
 
 
 def _measures(record: Record, name: str, values: np.ndarray) -> bool:

@@ -34,7 +34,8 @@ EXCHANGE = 2.0
 class Found:
     """One accepted addition and the ranking that spoke for it; `rows` are given up with it.
 
-    `paired`: the first of two that show together and not alone; the next is the other.
+    `paired`: the first of two that show together and not alone; the next is the other. `beside`: the driver of which
+    any function may be there besides, for which it needed so much `more` (nats).
     """
 
     name: str
@@ -42,6 +43,8 @@ class Found:
     rows: tuple[int, ...]
     ranking: Ranking
     paired: bool = False
+    beside: str = ""
+    more: float = 0.0
 
     @property
     def frees_noise(self) -> bool:
@@ -114,6 +117,10 @@ class Steps:
             entangled = after
         return entangled
 
+    def rank_beside(self, estimate: Estimate, found: Sequence[Found], columns: np.ndarray) -> Ranking:
+        """All candidates beside a fit with what was found and beside further columns, which explain what they can."""
+        return rank_where_it_matters(self._seen(estimate), estimate, rows_of(found), columns)
+
     def rank(self, estimate: Estimate, found: Sequence[Found]) -> Ranking:
         """All candidates beside a fit with what was found; by their fits where the shapes searched mislead.
 
@@ -155,11 +162,11 @@ class Steps:
     ) -> bool:
         """Whether some steps fit better by so many nats than others, of this search or another, on what both keep.
 
-        One of both may be none at all.
+        Both may be none at all.
         """
         each = [*found, *other]
-        given_up = Found("", None, rows_of(each), each[0].ranking)
-        one, two = (s.fit([*steps, given_up]) for s, steps in ((self, found), (of or self, other)))
+        given_up = [Found("", None, rows_of(each), each[0].ranking)] if each else []
+        one, two = (s.fit([*steps, *given_up]) for s, steps in ((self, found), (of or self, other)))
         return one is not None and (two is None or bool(_quality(one) > _quality(two) + by))
 
     def _has_shape(self, name: str) -> bool:

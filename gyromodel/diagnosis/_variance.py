@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ from gyromodel._checks import thermometers
 from gyromodel._noise_level import FORMS
 from gyromodel.campaign import Campaign
 from gyromodel.declarations import RATE_OF
-from gyromodel.estimate import Estimate
+from gyromodel.estimate import Estimate, EstimateError, fit_record
 from gyromodel.model import Level
 from gyromodel.numerics.rounding import quantum
 from gyromodel.signals import Record
@@ -21,6 +22,9 @@ SIGNIFICANT = 1e-5
 # Standard deviations from which on the residuals of a high noise level follow one another.
 FOLLOW = 4.0
 HEAVY = 6.0
+# Greatest slope of ln σ² over the range of what it follows; turns of it and of the fit, which end where it changes by
+# less than this.
+STEEPEST, TURNS, SETTLED = 12.0, 6, 0.02
 # Two-sided significance at which a stated noise level is contradicted.
 CONTRADICTED = 1e-4
 # Sample intervals that differ by this factor are of different kinds.
@@ -98,12 +102,26 @@ def growing_noise(record: Record, estimate: Estimate) -> Growth | None:
     if best is None or stats.chi2.sf(best[0], 1) * len(drivers) > SIGNIFICANT:
         return None
     x = best[2][: record.rows][use]
-    slope = _log_slope(x, estimate.whitened[use] ** 2)
-    white = np.exp(slope * (np.clip(best[2], 0.0, 1.0) - 0.5))
+    slope, fitted, alone = 0.0, estimate, np.asarray(record.sampling.white)
+    white, changes = alone, list[float]()
+    # Slow noise, which does not grow, is a part of the quiet samples' scatter: in turns.
+    for turn in range(TURNS):
+        changes.append(_log_slope(x, fitted.whitened[use] ** 2))
+        slope = float(np.clip(slope + changes[-1], -STEEPEST, STEEPEST))
+        white = alone * np.exp(slope * (np.clip(best[2], 0.0, 1.0) - 0.5))
+        if np.abs(changes[-1]) < SETTLED or turn == TURNS - 1:
+            break
+        try:
+            data = with_variance(estimate.record, white)
+            fitted = fit_record(data, replace(estimate.model, noise={}), start=estimate.ratios)
+        except EstimateError:
+            break
     ratio = float(np.exp(0.5 * slope))
-    std = ratio * float(np.sqrt(0.5 / np.sum((x - x.mean()) ** 2)))
+    # A turn makes up as much of what the slope lacks as scatter is white, and only that part of it tells the slope.
+    share = 1.0 - np.clip(changes[1] / changes[0], 0.0, 0.9) if len(changes) > 1 else 1.0
+    std = ratio * float(np.sqrt(0.5 / np.sum((x - x.mean()) ** 2)) / share)
     evidence = 0.5 * (best[0] - np.log(len(e))) - np.log(len(drivers))
-    return Growth(best[1], np.asarray(record.sampling.white) * white, ratio, std, float(evidence))
+    return Growth(best[1], white, ratio, std, float(evidence))
 
 
 def _log_slope(x: np.ndarray, square: np.ndarray) -> float:
@@ -116,7 +134,7 @@ def _log_slope(x: np.ndarray, square: np.ndarray) -> float:
         beta = beta + np.clip(step, -1, 1)
         if np.abs(step).max() < 1e-6:
             break
-    return float(np.clip(beta[1], -12, 12))
+    return float(np.clip(beta[1], -STEEPEST, STEEPEST))
 
 
 def with_variance(record: Record, white: np.ndarray) -> Record:

@@ -9,7 +9,7 @@ import numpy as np
 
 from gyromodel._checks import thermometers
 from gyromodel.campaign import Campaign
-from gyromodel.declarations import EARLIER, RATE_OF, measured
+from gyromodel.declarations import BEHIND, EARLIER, RATE_OF, measured
 from gyromodel.diagnosis._apart import like, twins
 from gyromodel.diagnosis._causes import cause_of
 from gyromodel.diagnosis._drivers import smooth_columns
@@ -18,7 +18,7 @@ from gyromodel.diagnosis._points import levels
 from gyromodel.diagnosis._ranking import SLOW_IN_TIME, TIME_MARGIN, Ranking, is_driver, is_noise, special_cases
 from gyromodel.diagnosis._result import CREDIBLE, VAGUE, Cause, ParameterValue, Verdict
 from gyromodel.diagnosis._rounded import curve_of_rounding, no_farther, no_larger, of_rounding
-from gyromodel.diagnosis._said import places, told, told_of_cause, told_of_rest
+from gyromodel.diagnosis._said import places, told, told_of_cause, told_of_driver, told_of_rest
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import Selection
 from gyromodel.diagnosis._shapes import remaining
@@ -127,13 +127,15 @@ def judge(
         beside = {f.name for f in selection.found if f is not step}
         findings += told_of_cause(steps, step, extended, {*members, *beside})
         turn = sum(f.name == step.name for f in selection.found[i:])
-        least, statistic = steps.least(ranking, step.name), ranking.statistic[step.name]
+        least, statistic = steps.least(ranking, step.name) + step.more, ranking.statistic[step.name]
         held = {r.name: r.value for r in steps.baseline.table() if r.effect == step.name and not r.std > 0.0}
         cause = cause_of(scanner, extended, step, turn, ranking, members, statistic, trials, null_scores, least, held)
         causes.append(replace(cause, places=places(sorted(step.points), searched)) if step.points else cause)
         sets.append(members)
     sets = _with_doubts(causes, sets, extended)
-    order = sorted(range(len(causes)), key=lambda i: -causes[i].statistic)
+    # Dwells of a series that are anomalous hide nothing else.
+    aside = [c.effect == "outliers" and not scanner.by_points for c in causes]
+    order = sorted(range(len(causes)), key=lambda i: (aside[i], -causes[i].statistic))
     causes, sets = [causes[i] for i in order], [sets[i] for i in order]
     if selection.remains and not selection.unresolved:
         findings.append(told_of_rest(selection, extended))
@@ -144,6 +146,11 @@ def judge(
             "of the output would tell."
         )
         driver = None
+    findings += told_of_driver(scanner, selection, driver) if driver else ()
+    if driver and any(f.beside for f in selection.found):
+        findings.append(
+            "Sizes of names beside it are fitted with what has no name as noise, as their uncertainties say."
+        )
     unexplained = {" and ".join(smooth_columns(driver)): share} if driver else {}
 
     def judged(verdict: Verdict, causes: Sequence[Cause], credible: dict[str, float], **more: str | None) -> Judgement:
@@ -151,17 +158,18 @@ def judge(
         once = tuple(dict.fromkeys(findings))
         return Judgement(verdict, tuple(causes), credible, unexplained=unexplained, findings=once, **what)
 
-    strongest = max((c.statistic for c in causes), default=0.0)
+    effects = [c for c in causes if scanner.by_points or c.effect != "outliers"]
+    strongest = max((c.statistic for c in effects), default=0.0)
     if driver and (share > UNKNOWN_SHARE or last.statistic[driver] > UNKNOWN_EVIDENCE * strongest):
         return judged("unknown", causes, {driver: 1.0}, driver=driver, next_test=_test_of_driver(driver))
-    if not saw_tooth and _outweighed(causes, selection, scanner.record.domain):
+    if not saw_tooth and _outweighed(effects, selection, scanner.record.domain):
         # A name holds less of what is there than it leaves, in a form that it cannot have; or all of them do.
         driver, score = last.best(drivers=True)
         driver = driver if score > steps.threshold else None
         return judged("unknown", causes, {driver or str(selection.remains): 1.0}, driver=driver)
     # Single gross errors are no cause, however many of them a search did not come to.
-    if not causes and selection.remains and not saw_tooth and (scanner.by_points or selection.remains != "outliers"):
-        return judged("unknown", (), {selection.remains: 1.0})
+    if not effects and selection.remains and not saw_tooth and (scanner.by_points or selection.remains != "outliers"):
+        return judged("unknown", causes, {selection.remains: 1.0})
     if not causes:
         return judged("adequate", (), {})
     for cause, members in zip(causes[1:], sets[1:], strict=True):
@@ -204,7 +212,7 @@ def _members(
         doubts = {"scale_spline": _unrepeated(scanner, bad), "bias_step": in_a_row and scanner.steps}
         rivals = [k for k, possible in doubts.items() if possible]
         if not rivals:
-            return members if scanner.by_points else {}
+            return members if scanner.by_points or bad.any() else {}
         own = {k: 0.5 * share for k, share in members.items()}
         members = own | {k: 0.5 / len(rivals) + own.get(k, 0.0) for k in rivals}
     if isinstance(step.effect, BiasPeriodic) and of_rounding(extended):
@@ -249,7 +257,7 @@ def _test_of_driver(driver: str) -> str:
     how = "in steps up and down"
     if RATE_OF in forms:
         how = "in ramps of several speeds up and down"
-    elif EARLIER in forms:
+    elif {EARLIER, BEHIND} & set(forms):
         how = "in steps held until nothing changes any more"
     return f"Vary {' and '.join(bases)} alone, {how}, everything else held, and repeat the run."
 

@@ -29,6 +29,19 @@ class ParameterRow(NamedTuple):
     unit: str
 
 
+class ParameterTable(tuple[ParameterRow, ...]):
+    """Rows of parameters, which print as a table."""
+
+    __slots__ = ()
+
+    def __str__(self) -> str:
+        """A line a parameter: its effect, its value with the standard uncertainty where it is free, and its unit."""
+        rows = [(r.effect, r.name, f"{r.value:.8g}", f"± {r.std:.2g}" if r.std else "(fixed)", r.unit) for r in self]
+        widths = [max(map(len, cells)) for cells in zip(*rows, strict=True)]
+        lines = ("  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)) for row in rows)
+        return "\n".join(line.rstrip() for line in lines)
+
+
 @dataclass(frozen=True)
 class Calibration:
     """A model with all its values, and what its fit left.
@@ -70,7 +83,7 @@ class Calibration:
             return np.full(len(self.model.slots()), np.nan)
         return np.sqrt(np.diag(self.covariance))
 
-    def table(self) -> tuple[ParameterRow, ...]:
+    def table(self) -> ParameterTable:
         """Every parameter in its reporting unit; those held fixed have standard uncertainty zero."""
         spread = {(s.effect, s.field, s.index): sd for s, sd in zip(self.model.slots(), self.std, strict=True)}
         rows = []
@@ -84,4 +97,4 @@ class Calibration:
                     rows.append(
                         ParameterRow(effect.label, shown, value * scale, spread.get((i, name, j), 0.0) * scale, unit)
                     )
-        return tuple(rows)
+        return ParameterTable(rows)

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from gyromodel._checks import thermometers
-from gyromodel.estimate._calibration import Calibration, ParameterRow
-from gyromodel.model import GyroModel, parameter_unit
+from gyromodel._model_units import parameter_unit
+from gyromodel.estimate._calibration import Calibration, ParameterTable
+from gyromodel.model import GyroModel
 from gyromodel.noise import NoiseRatios, coefficients, noise_units
 from gyromodel.numerics.uncertain import Source, Uncertain, factor_of
 from gyromodel.signals import Record
@@ -84,7 +85,7 @@ class Estimate:
         """
         return calibration_of(self.model, self.covariance, self.record, self.degrees_of_freedom)
 
-    def table(self) -> tuple[ParameterRow, ...]:
+    def table(self) -> ParameterTable:
         """Every parameter in its reporting unit; those held fixed have standard uncertainty zero."""
         return self.calibration().table()
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gyromodel._checks import CampaignError
+from gyromodel._model_units import check_domain, check_units
 from gyromodel._noise_level import with_stated_level
 from gyromodel.attitude import refuse_navigated, with_reference_rates
 from gyromodel.averages import MEAN_OF_ATTITUDE, average
@@ -21,7 +22,7 @@ from gyromodel.estimate._noise import best_ratios, settled, with_noise_intervals
 from gyromodel.estimate._optimistix import optimistix_solution
 from gyromodel.estimate._rounding import fit_readings, with_step_of
 from gyromodel.estimate._whitening import filter_of, pad_columns, whiten_columns
-from gyromodel.model import GyroModel, ModelError, check_domain, check_units
+from gyromodel.model import GyroModel, ModelError
 from gyromodel.noise import NoiseRatios, from_grams, stated_ratios
 from gyromodel.numerics.least_squares import Normal, Solution, levenberg_marquardt
 from gyromodel.numerics.state_space import Filter, colour, whitened_gram

@@ -9,10 +9,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from gyromodel._model_units import check_reading
 from gyromodel.campaign import Campaign
 from gyromodel.effects.converter import Quantisation
 from gyromodel.estimate._estimate import Estimate, EstimateError
-from gyromodel.model import GyroModel, ModelError, check_reading
+from gyromodel.model import GyroModel, ModelError
 from gyromodel.noise import NoiseRatios
 from gyromodel.numerics.rounding import grid_step, noise_at, noise_before, rounded_variance, staircase
 from gyromodel.signals import Record

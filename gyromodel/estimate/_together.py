@@ -12,10 +12,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from gyromodel._compiling import former_fusions
+from gyromodel._model_units import check_units
 from gyromodel._noise_level import with_stated_level
 from gyromodel.estimate._blocks import BLOCK, Blocks, gram_of, in_turn
 from gyromodel.estimate._fit import check_enough, given_ratios
-from gyromodel.model import GyroModel, ModelError, check_units
+from gyromodel.model import GyroModel, ModelError
 from gyromodel.noise import NoiseRatios, markov_sum
 from gyromodel.numerics.compiled_least_squares import Search, search_minimum
 from gyromodel.numerics.state_space import Sampling, build_filter

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gyromodel.declarations import RATE_OF
+from gyromodel.declarations import BEHIND, RATE_OF
 from gyromodel.report import _drawing as draw
 from gyromodel.report._numbers import number, percent, unit_text
 from gyromodel.report._sentence import followed
@@ -205,7 +205,7 @@ def _found(diagnosis: Diagnosis, known: dict[str, Abscissa]) -> Drawn:
     scale = 10.0**power
     first, *more = followed(diagnosis)
     # A response depends on what the rate was before and after as well.
-    if more or first == RATE_OF.format("rate"):
+    if more or first in (RATE_OF.format("rate"), BEHIND.format("rate")):
         axes.plot(x, y / scale, ".", color=draw.AFTER, markersize=4.0, zorder=5, label="function found")
         caption = f"Points: the function found, which depends on more than {driven(first)}, where it was measured."
     else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from gyromodel.report._numbers import number, pair, stated, unit_text, with_uncertainty
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
     from gyromodel.diagnosis._result import Cause, Diagnosis, ParameterValue
     from gyromodel.estimate._calibration import ParameterRow
 
+# Share of the posterior from which on a name has no rival (`diagnosis`).
+CREDIBLE = 0.95
 Held = dict[str, "ParameterRow"]
 
 
@@ -111,16 +114,24 @@ def _unknown(diagnosis: Diagnosis) -> str:
     elif "bias_periodic" in diagnosis.credible_set:
         follows = "oscillates with a size or a frequency that changes,"
     lead = f"Something real is missing from your simulation: its error {follows} and matches nothing in the catalogue"
-    if effects := [cause for cause in diagnosis.causes if cause.effect != "outliers"]:
-        lead += f", though {_sized(diagnosis, effects)} would take up part of it"
-    gain = _gain(diagnosis, "with the curve that was found" if diagnosis.driver else "with what was found")
-    return f"{lead}; {gain}."
+    effects = [cause for cause in diagnosis.causes if cause.effect != "outliers"]
+    # What shows beside any function of the driver is no part of it.
+    shown = {after.added for step, after in pairwise(diagnosis.rounds) if step.beside}
+    besides = [cause for cause in effects if cause.effect in shown]
+    if apart := [cause for cause in besides if cause.posterior >= CREDIBLE]:
+        lead += f"; whatever that is, there is {_sized(diagnosis, apart)} besides"
+    if doubtful := [cause for cause in besides if cause not in apart]:
+        lead += f"; besides there may be {_sized(diagnosis, doubtful)}, or what is much like it"
+    if within := [cause for cause in effects if cause not in besides]:
+        lead += f", though {_sized(diagnosis, within)} would take up part of it"
+    curve = "with the curve that was found" if diagnosis.driver else "with what was found"
+    return f"{lead}; {_gain(diagnosis, 'with what has a name' if apart else curve)}."
 
 
 def _pronoun(diagnosis: Diagnosis) -> str:
     causes = diagnosis.causes
     if all(cause.effect == "outliers" for cause in causes):
-        return "with them set aside" if sum(len(cause.points) for cause in causes) != 1 else "with it set aside"
+        return "with them set aside" if sum(len(c.parameters or c.points) for c in causes) != 1 else "with it set aside"
     if all(held(diagnosis, cause.effect) for cause in causes):
         return "with these" if len(causes) > 1 else "with that"
     return "with them" if len(causes) > 1 else "with it"
@@ -134,8 +145,10 @@ def _lacks(diagnosis: Diagnosis, causes: Sequence[Cause]) -> str:
     said = [f"lacks {_sized(diagnosis, missing)}"] if missing else []
     said += [f"holds {', and '.join(wrong)}"] if wrong else []
     if len(effects) < len(causes):
-        apart = sum(len(cause.points) for cause in causes if cause.effect == "outliers")
-        what = "point, which stands" if apart == 1 else "points, which stand"
+        those = [cause for cause in causes if cause.effect == "outliers"]
+        rows, apart = sum(len(c.points) for c in those), sum(len(c.parameters or c.points) for c in those)
+        kind = "dwell" if apart < rows else "point"
+        what = f"{kind}, which stands" if apart == 1 else f"{kind}s, which stand"
         said.append(f"cannot explain {apart or 'some'} measured {what} apart from all the others")
     return f"Your simulation {', and '.join(said)}" if said else "Something real is missing from your simulation"
 
@@ -203,7 +216,7 @@ def _gain(diagnosis: Diagnosis, extension: str) -> str:
     if gain.scheme == "not measured":
         return "the gain on data not used was not measured"
     if not (math.isfinite(gain.before) and math.isfinite(gain.after)):
-        return "the campaign is too short to measure the gain on data not used"
+        return "the gain on data not used was not measured, as no two blocks can be left out and predicted"
     before, after = pair(gain.before, gain.after)
     unit = unit_text(gain.unit)
     if gain.before == gain.after:
@@ -215,7 +228,7 @@ def _gain(diagnosis: Diagnosis, extension: str) -> str:
         return f"{extension} the error on data not used falls from {before} to {after} {unit}"
     if high < 1.0:
         return f"{extension} the error on data not used rises from {before} to {after} {unit}"
+    moves = f"the error on data not used goes from {before} to {after} {unit}, within its own scatter"
     if math.isfinite(gain.log_score_ci95[0]) and gain.log_score_ci95[0] > 0.0:
-        moves = f"the error on data not used hardly moves ({before} to {after} {unit})"
         return f"{extension} {moves}, but the spread of those data is clearly better predicted"
-    return f"{extension} the error on data not used goes from {before} to {after} {unit}, within its own scatter"
+    return f"{extension} {moves}"

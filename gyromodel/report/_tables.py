@@ -55,11 +55,11 @@ def _helped(parameter: ParameterValue) -> str:
 
 
 def rankings(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Per round, the best candidates with bars of evidence."""
+    """Beside the simulation, and after each addition, the best candidates with bars of evidence."""
     kind = kinds(diagnosis)
-    added = {cause.effect for cause in diagnosis.causes}
+    following = [step.added for step in diagnosis.rounds[1:]]
     tables = []
-    for index, step in enumerate(diagnosis.rounds, 1):
+    for step, chosen in zip(diagnosis.rounds, [*following, None], strict=False):
         ranked = sorted(step.ranking, key=lambda c: -c.statistic if math.isfinite(c.statistic) else math.inf)
         ranked = ranked[:_RANKED]
         top = max([diagnosis.threshold, *(c.statistic for c in ranked if math.isfinite(c.statistic))], default=1.0)
@@ -72,13 +72,15 @@ def rankings(diagnosis: Diagnosis) -> list[dict[str, Any]]:
                 "bar": _bar(c.statistic, top),
                 "above": c.statistic > diagnosis.threshold,
                 "posterior": percent(c.posterior),
-                "chosen": c.effect == step.added or (step.added is None and c.effect in added),
+                "chosen": c.effect == chosen,
             }
             for c in ranked
         ]
         mark = _bar(diagnosis.threshold, top)
-        added_title = step.added and title(step.added, kind.get(step.added, "effect"))
-        tables.append({"number": index, "added": added_title, "rows": rows, "mark": mark})
+        with_it = step.added and phrase(step.added, kind.get(step.added, "effect"))
+        beside = f"with {with_it} added{' too' * (len(tables) > 1)}" if with_it else "beside your simulation"
+        beside += f" and {phrase(step.beside)}" if step.beside else ""
+        tables.append({"title": f"Round {len(tables) + 1}: ranked {beside}", "rows": rows, "mark": mark})
     return tables
 
 
@@ -88,7 +90,8 @@ def ladder(diagnosis: Diagnosis) -> list[dict[str, str]]:
     kind = kinds(diagnosis)
     shown = [_step(index, step, kind.get(step.added or "", "effect")) for index, step in enumerate(steps, 1)]
     if math.isfinite(diagnosis.gain.before):
-        start = {"number": "0", "title": "Your simulation", "id": "", "statistic": "", "score": ""}
+        score = evidence(diagnosis.rounds[0].log_score)
+        start = {"number": "0", "title": "Your simulation", "id": "", "statistic": "", "score": score}
         shown.insert(0, start | {"held_out": number(diagnosis.gain.before, 3)})
     return shown
 
@@ -138,6 +141,7 @@ def noise(noise: Mapping[str, Mapping[str, float | str]], of: str) -> list[dict[
     for name, entry in noise.items():
         value, low, high = (float(entry.get(key, math.nan)) for key in ("value", "lo", "hi"))
         interval = f"{number(low, 3)} to {number(high, 3)}" if math.isfinite(high) else "too few samples to tell"
+        interval = "stated" if low == value == high else interval
         unit = unit_text(str(entry.get("unit", "")))
         rows.append(
             {"title": title(name, of), "id": name, "value": number(value, 3), "interval": interval, "unit": unit}
@@ -164,12 +168,19 @@ def noise_kinds(diagnosis: Diagnosis) -> str:
         return ""
 
     def made_of(name: str, share: float) -> str:
-        return (
-            f"{listed([title(part, noise_of(diagnosis)).lower() for part in name.split(' + ')])} ({100 * share:.0f} %)"
-        )
+        parts = [title(part, noise_of(diagnosis)) for part in name.split(" + ")]
+        return f"{listed([part if 'Markov' in part else part.lower() for part in parts])} ({100 * share:.0f} %)"
 
-    likely = [made_of(*kind) for kind in kinds[:2] if kind[1] >= 0.05]
-    return f"Most probably {', or '.join(likely)}."
+    likely = dict(kind for kind in kinds[:2] if kind[1] >= 0.05)
+    of_fit = ""
+    if "noise_markov" not in diagnosis.noise and all("noise_markov" in name for name in likely):
+        of_fit = " The terms below are those of the fit, which holds no Markov noise."
+    elif "noise_markov" in diagnosis.noise and not any("noise_markov" in name for name in likely):
+        of_fit = (
+            " The terms below are those of the fit, in which Markov noise was likeliest; the shares weigh besides that "
+            "such noise is rarer, one to twenty beforehand."
+        )
+    return f"Most probably {', or '.join(made_of(*kind) for kind in likely.items())}.{of_fit}"
 
 
 def searched_rows(diagnosis: Diagnosis) -> list[dict[str, str]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Container, Sequence
 
-from gyromodel.declarations import EARLIER, RATE_OF, column_of, measured
+from gyromodel.declarations import BEHIND, EARLIER, RATE_OF, column_of, measured
 
 PHRASES = {
     "scale_factor": "a scale-factor error",
@@ -118,6 +118,8 @@ def driven(column: str) -> str:
         return "angular acceleration"
     if (base, form) == ("rate", EARLIER):
         return "the root mean square of the rate some time before"
+    if form == BEHIND:
+        return f"the {spoken(base)} some time before, less the {spoken(base)} itself"
     after = {RATE_OF: " rate", EARLIER: " some time before"}.get(form, "")
     return _DRIVERS.get(base, spoken(base)) + after
 

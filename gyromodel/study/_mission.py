@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from gyromodel._model_units import check_units
 from gyromodel.averages import MAXIMUM_ROWS, average
 from gyromodel.campaign import Campaign
 from gyromodel.estimate import check_covariates
-from gyromodel.model import GyroModel, ModelError, check_units
+from gyromodel.model import GyroModel, ModelError
 from gyromodel.platform import Navigation, drift_errors, navigate, pushes_at_rest
 from gyromodel.signals import Record, read_signals
 

@@ -10,13 +10,14 @@ import numpy as np
 from jaxtyping import Float
 
 from gyromodel._checks import NUMBERED
+from gyromodel._model_units import check_units
 from gyromodel._noise_level import with_stated_level
 from gyromodel.averages import average
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis import added_tests
 from gyromodel.effects import Effect
 from gyromodel.estimate import as_read, check_covariates, filter_of, given_ratios, step_of, whiten_columns
-from gyromodel.model import GyroModel, ModelError, check_units
+from gyromodel.model import GyroModel, ModelError
 from gyromodel.signals import OFF, read_signals, with_columns_known
 from gyromodel.study._budget import Budget
 from gyromodel.study._instruments import Instrument, output_by_column

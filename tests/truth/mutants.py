@@ -23,7 +23,6 @@ def _patches(name: str) -> dict[str, Any]:
     if not name:
         return {}
     from gyromodel.diagnosis import _diagnose, _scan, _session
-    from gyromodel.diagnosis._evidence import log_evidence_ratio
     from gyromodel.estimate import fit_record
 
     run_many, grid = _scan.Scanner.run_many, _session.noise_grid
@@ -53,7 +52,7 @@ def _patches(name: str) -> dict[str, Any]:
         "no_projection": {"_scan.Scanner.run_many": nothing_projected},
         "no_look_elsewhere": {
             "_one_cell.log_mean_of_parts": best_of_parts,
-            "_one_cell.log_mean_evidence": lambda t, *of: log_evidence_ratio(t.max(axis=0), *of),
+            "_one_cell.log_mean": lambda ratios: ratios.max(axis=0),
         },
         "forced": forced,
         "forced_no_nesting": forced | {"_diagnose._gain": refitted},
