@@ -10,7 +10,7 @@ import numpy as np
 
 from gyromodel.diagnosis._bank import Bank, Block
 from gyromodel.diagnosis._evidence import log_evidence_ratio, log_sum
-from gyromodel.diagnosis._ranking import Ranking, is_driver
+from gyromodel.diagnosis._ranking import Ranking, is_driver, special_cases
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._tangents import VANISHED
 
@@ -36,7 +36,11 @@ def best_pair(scanner: Scanner, ranking: Ranking, but: Container[str] = ()) -> t
                 each = _forms(bank, ranking, name)
                 names += [name] * len(each)
                 blocks += each
-    if len(set(names)) < 2:
+    # What contains another as a special case is one cause with it.
+    own = [{name, *special_cases(name)} for name in names]
+    two = combinations(range(len(names)), 2)
+    pairs = np.array([(i, j) for i, j in two if names[i] not in own[j] and names[j] not in own[i]])
+    if not len(pairs):
         return None, -np.inf
     columns = np.zeros((len(bank.columns), len(names), WIDEST))
     for i, b in enumerate(blocks):
@@ -44,7 +48,6 @@ def best_pair(scanner: Scanner, ranking: Ranking, but: Container[str] = ()) -> t
     base, p = ranking.baseline_columns, ranking.baseline_columns.shape[1]
     data = np.column_stack([base, columns.reshape(len(columns), -1), ranking.residual])
     data = np.where(scanner.present[:, None], data, 0.0)
-    pairs = np.array([(i, j) for i, j in combinations(range(len(names)), 2) if names[i] != names[j]])
     each = np.array([np.log(forms[name]) + bank.price(name) for name in names])
     price = np.log((len(set(names)) - 1) / 2) + each[pairs].sum(axis=1)
     nu = scanner.degrees_of_freedom - p
