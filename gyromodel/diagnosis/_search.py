@@ -277,6 +277,16 @@ def _beside_driver(steps: Steps, selection: Selection) -> Selection:
     barred = ("outliers", *slow, *dropped)
     found, path, estimates = list(selection.found), list(selection.path), list(selection.estimates)
     estimates[-1] = selection.estimate
+    # What was found before is one of these where it holds beside the function too.
+    for i, step in [(i, f) for i, f in enumerate(found) if f.effect and f.name not in barred]:
+        rest = [*found[:i], *found[i + 1 :]]
+        if (without := steps.fit(rest)) is None:
+            continue
+        ranking = steps.rank_beside(without, rest, columns)
+        if ranking.statistic.get(step.name, -np.inf) >= steps.least(ranking, step.name) + more:
+            found[i] = replace(step, beside=driver, more=more, ranking=ranking)
+            path = [found[i] if f is step else f for f in path]
+    marked = tuple(found)
     while len(path) < MAXIMUM_ROUNDS:
         ranking = steps.rank_beside(estimates[-1], found, columns)
         noises = (k for k in ranking.statistic if is_noise(k))
@@ -288,12 +298,12 @@ def _beside_driver(steps: Steps, selection: Selection) -> Selection:
         if after is None or unresolved(after, step, scanner.step):
             break
         found, path, estimates = standing([*found, step]), [*path, step], [*estimates, after]
-    if len(path) == len(selection.path):
+    if len(path) == len(selection.path) and not any(f.beside for f in path):
         return selection
     last = steps.rank(estimates[-1], found)
     if significant_driver(last, steps.threshold) != driver:
         return selection
-    as_before = found[: len(selection.found)] == list(selection.found)
+    as_before = [*map(id, found[: len(marked)])] == [*map(id, marked)]
     left_out = dict(selection.left_out) if as_before else {}
     for i in [i for i, f in enumerate(found) if f.beside and len(found) > 1]:
         rest = [*found[:i], *found[i + 1 :]]
