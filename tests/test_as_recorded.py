@@ -47,21 +47,50 @@ def test_a_drop_out_of_the_logger_restarts_no_warm_up(rng: np.random.Generator):
 
 
 @pytest.mark.parametrize("amplitude", [8.0, pytest.param(0.0, marks=pytest.mark.long)])
-def test_a_warm_up_behind_every_gap_is_named_without_a_column_run(amplitude: float, rng: np.random.Generator):
+def test_a_warm_up_behind_every_gap_is_named_once_a_column_run_tells(amplitude: float, rng: np.random.Generator):
     """A minute of each of six turn-ons, 8 deg/h that decay in 15 s: lines had been named, which fail held out."""
-    on, turn = np.tile(np.arange(60.0), 6), np.repeat(np.arange(6), 60)
+    on, turn = np.tile(np.arange(60.0), 6), np.repeat(np.arange(6.0), 60)
     output = amplitude * np.exp(-on / 15.0) + rng.standard_normal(360)
-    time = on + np.cumsum(rng.uniform(1000.0, 7000.0, 6).round())[turn]
-    found = gm.diagnose(campaign(output).with_column("time", time, "s"), model_from_effects(["bias"]))
+    time = on + np.cumsum(rng.uniform(1000.0, 7000.0, 6).round())[turn.astype(int)]
+    gaps, bias = campaign(output).with_column("time", time, "s"), model_from_effects(["bias"])
+    found = gm.diagnose(gaps, bias)
     counted = any("warm-up behind every gap" in line for line in found.findings)
     if not amplitude:
         assert (found.verdict, counted) == ("adequate", False)
         return
-    assert (found.verdict, [c.effect for c in found.causes], counted) == ("named", ["bias_warmup"], True)
-    size, tau = found.causes[0].parameters
-    assert size.value == pytest.approx(amplitude, abs=4 * size.std)
-    assert tau.value == pytest.approx(15.0, abs=4 * tau.std)
+    assert (found.verdict, found.causes[0].effect, counted) == ("ambiguous", "bias_warmup", True)
+    assert found.credible_set == {"bias_warmup": 0.5, "smooth(time)": 0.5}
+    assert "column run" in str(found.next_test)
     assert found.gain.ci95[0] > 1.5
+    named = gm.diagnose(gaps.with_column("run", turn, ""), bias, hold_out=False)
+    assert (named.verdict, [c.effect for c in named.causes]) == ("named", ["bias_warmup"])
+    for told in (found, named):
+        size, tau = told.causes[0].parameters
+        assert size.value == pytest.approx(amplitude, abs=4 * size.std)
+        assert tau.value == pytest.approx(15.0, abs=4 * tau.std)
+
+
+@pytest.mark.long
+def test_what_settles_behind_every_gap_is_no_firm_warm_up(rng: np.random.Generator):
+    """A coil that follows its chamber to another temperature in each of six gaps, the gyro on all the time."""
+    on, turn = np.tile(np.arange(60.0), 6), np.repeat(np.arange(6), 60)
+    output = rng.uniform(5.0, 12.0, 6)[turn] * np.exp(-on / 15.0) + rng.standard_normal(360)
+    time = on + np.cumsum(rng.uniform(1000.0, 7000.0, 6).round())[turn]
+    found = gm.diagnose(campaign(output).with_column("time", time, "s"), model_from_effects(["bias"]), hold_out=False)
+    assert found.verdict in ("ambiguous", "unknown")
+
+
+def test_time_since_power_on_counts_from_every_gap_as_from_every_run(rng: np.random.Generator):
+    """Each start was recorded 30 s late; 25 000 rows are searched as means of two, which begin between samples."""
+    for rows in (300, 25_000):
+        run = np.repeat(np.arange(5.0), rows // 5)
+        time = np.arange(float(rows)) + 1000.0 * run
+        columns = {"time": time, "output": rng.standard_normal(rows)}
+        without = gm.Campaign(columns, {"time": "s", "output": "deg/h"}, {"kind": "rate", "time_since_power_on": "30"})
+        late = without.with_column("run", run, "")
+        since = read([without]).time_on
+        assert since is not None
+        assert np.allclose(since, read([late]).record.signals["time_on"])
 
 
 @pytest.mark.long

@@ -48,7 +48,8 @@ def test_every_python_block_of_the_readme_runs(tmp_path: Path):
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     bias, temperature, found, supply, *values = done.stdout.splitlines()
-    assert bias.startswith("bias  ") and temperature.startswith("bias_temperature  ")
+    assert bias.startswith("bias  ")
+    assert temperature.startswith("bias_temperature  ")
     assert found.startswith("named ['bias_temperature_rate'] ")
     assert f"# {supply}\n" in README
     assert f"# {', '.join(values)}\n" in README

@@ -127,7 +127,7 @@ def _of_gyro(measured: Sequence[Campaign]) -> Data:
         record = _of_means(record, campaigns, searched)
     time_on = None
     if len(as_given) == 1 and "run" not in as_given[0].columns:
-        time_on = _since_gaps(record)
+        time_on = _since_gaps(record, searched[0])
         record = _without_power_cycles(record, searched[0]) if "run" in searched[0].columns else record
     output_unit = campaigns[0].units["output"]
     if campaigns[0].metadata["kind"] != "rate":
@@ -145,14 +145,16 @@ def _without_power_cycles(record: Record, campaign: Campaign) -> Record:
     return record._replace(signals=record.signals | {"time_on": time_on})
 
 
-def _since_gaps(record: Record) -> Float[Array, " sample"] | None:
-    """Time since the last gap; none without one, or with so many that they are no power cycles."""
+def _since_gaps(record: Record, campaign: Campaign) -> Float[Array, " sample"] | None:
+    """Time since power-on had the gyro been off in each gap; none without one, or with too many for power cycles."""
     time = np.asarray(record.signals["time"])
     stretch = stretches_of(time[: record.rows])
     if not 0 < stretch.max() < MOST_POWER_CYCLES:
         return None
     begins = time[np.searchsorted(stretch, np.arange(stretch.max() + 1))]
-    return jnp.asarray(time - np.pad(begins[stretch], (0, len(time) - record.rows), mode="edge"))
+    since = time - np.pad(begins[stretch], (0, len(time) - record.rows), mode="edge")
+    # Each start was recorded as late as the first.
+    return jnp.asarray(since + begins[0] + time_since_power_on(campaign))
 
 
 def _of_means(record: Record, campaigns: Sequence[Campaign], means: Sequence[Campaign]) -> Record:

@@ -36,7 +36,7 @@ from gyromodel.diagnosis._session import (
 )
 from gyromodel.diagnosis._shapes import driver_shape, minimum_detectable, not_testable
 from gyromodel.diagnosis._variance import follow, growing_noise, noise_level, tails
-from gyromodel.diagnosis._verdict import FAINT, judge, structured, with_noise, with_steps
+from gyromodel.diagnosis._verdict import FAINT, judge, structured, undecided, with_noise, with_steps
 from gyromodel.estimate import (
     Estimate,
     EstimateError,
@@ -58,6 +58,9 @@ FOLD_NEARBY = 3.0
 TURNED_ON = (
     "There seems to be a warm-up behind every gap, as if the gyro had been off: its time is counted from there. The "
     "model is applied to files whose column run tells power cycles apart."
+)
+TELL_RUNS = (
+    "Number the power cycles in a column run; where the gyro was not off in the gaps, log the temperature at the coil."
 )
 SMOOTHED = (
     "Temperatures were smoothed: the error follows the smooth record better, so that the rest is noise of the "
@@ -148,7 +151,10 @@ def _diagnosed(
     if rounding.changed and (left_out := int(np.sum(record.present & ~session.record.present))):
         findings.append(f"{left_out} samples that stand apart from all others were left out beside rounding.")
     session, selection = over_angle_noise(session, selection, model, say) or (session, selection)
+    rival = None
     if data.time_on is not None and (others := over_power_cycles(session, selection, data.time_on, model, say)):
+        # What a gyro that was never off has in its place.
+        rival = next((f.name for f in selection.found if f.follows), "smooth(time)")
         session, selection = others
         findings.append(TURNED_ON)
     if record.domain == "gyro" and (others := over_smooth_thermometers(session, selection, model, say)):
@@ -245,6 +251,8 @@ def _diagnosed(
         beyond if baseline.noise_given else [c for c in beyond if c is hops],
         len(names),
     )
+    if rival:
+        judgement = undecided(judgement, "bias_warmup", rival, TELL_RUNS)
     coarse = rounding.changed or rounding.stuck or readings.coarse_beside(as_it_was, extended)
     if readings.untested and rounding.saw_tooth:
         findings.append("Campaigns are read in steps of their own: what is smaller than the coarsest may be rounding.")
@@ -271,7 +279,7 @@ def _diagnosed(
     if hops is not None:
         extended = stated_hops(extended, hops)
     next_test = judgement.next_test
-    if judgement.verdict == "ambiguous":
+    if judgement.verdict == "ambiguous" and not rival:
         alike = list(judgement.credible_set)
         next_test = settling_test(data.searched, baseline.model, extended, alike) or next_test
     gain = not_measured(unit) if not hold_out else _gain(session, baseline, selection, unit, scale, weights, say)

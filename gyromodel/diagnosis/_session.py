@@ -166,6 +166,8 @@ def over_power_cycles(
 ) -> tuple[Session, Selection] | None:
     """The search as if the gyro had been off in every gap, where a warm-up after each explains the data better.
 
+    Not where structure is left that has no name: what is unknown stays so.
+
     Args:
         session: the search as if it never had been.
         selection: what that found.
@@ -173,6 +175,8 @@ def over_power_cycles(
         model: the simulation.
         say: progress.
     """
+    if selection.unfinished:
+        return None
     record = session.record._replace(signals=session.record.signals | {"time_on": time_on})
     try:
         off = laid_out(
@@ -181,12 +185,14 @@ def over_power_cycles(
     except EstimateError:
         return None
     # Nothing else asks when the gyro was turned on.
-    warms = "bias_warmup" in model.labels
-    if not warms and off.steps.rank(off.baseline, []).statistic.get("bias_warmup", -np.inf) < off.threshold:
+    if "bias_warmup" in model.labels:
+        better = off.steps.fits_better((), (), EXCHANGE, session.steps)
+        return (off, off.run(say)) if better else None
+    if off.steps.rank(off.baseline, []).statistic.get("bias_warmup", -np.inf) < off.threshold:
         return None
     other = off.run(say)
-    warms = warms or any(f.name == "bias_warmup" for f in other.found)
     ahead = EXCHANGE + selection.followed - other.followed
+    warms = any(f.name == "bias_warmup" for f in other.found)
     return (off, other) if warms and off.steps.fits_better(other.found, selection.found, ahead, session.steps) else None
 
 

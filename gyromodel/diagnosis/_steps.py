@@ -57,6 +57,11 @@ class Found:
         return self.effect is not None or self.frees_noise
 
     @property
+    def follows(self) -> set[str]:
+        """The columns beside time that it needs."""
+        return {*self.effect.columns_needed} - {"time"} if self.effect is not None else set()
+
+    @property
     def grows(self) -> bool:
         """Whether there may be more to it than this form; each further line is a cause of its own."""
         return self.effect is not None and self.effect.may_grow and not self.effect.scan

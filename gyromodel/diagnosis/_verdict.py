@@ -298,6 +298,19 @@ def structured(judgement: Judgement, ranking: Ranking, column: str) -> Judgement
     return replace(judgement, verdict="unknown", credible_set={name: 1.0}, driver=driver, next_test=test)
 
 
+def undecided(judgement: Judgement, name: str, rival: str, test: str) -> Judgement:
+    """The judgement where what was found as `name` may as well be `rival`, until a test tells."""
+    if judgement.verdict == "unknown" or all(c.effect != name for c in judgement.causes):
+        return judgement
+    others = judgement.credible_set if judgement.verdict == "ambiguous" else {}
+    shares = {name: 0.5, rival: 0.5} | {k: v for k, v in others.items() if k not in (name, rival)}
+    shares = {k: v / sum(shares.values()) for k, v in shares.items()}
+    cause = next(c for c in judgement.causes if c.effect == name)
+    pair = _as_set(replace(cause, posterior=shares[name]), shares)
+    rest = tuple(c for c in judgement.causes if c.effect not in shares)
+    return replace(judgement, verdict="ambiguous", causes=(*pair, *rest), credible_set=shares, next_test=test)
+
+
 def with_steps(judgement: Judgement, steps: Cause) -> Judgement:
     """The judgement with steps of the output beside what else the simulation lacks."""
     if judgement.verdict == "adequate":

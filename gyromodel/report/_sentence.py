@@ -125,7 +125,7 @@ def _unknown(diagnosis: Diagnosis) -> str:
     if within := [cause for cause in effects if cause not in besides]:
         lead += f", though {_sized(diagnosis, within)} would take up part of it"
     curve = "with the curve that was found" if diagnosis.driver else "with what was found"
-    return f"{lead}; {_gain(diagnosis, 'with what has a name' if apart else curve)}."
+    return f"{lead}; {_gain(diagnosis, 'with what has a name' if besides else curve)}."
 
 
 def _pronoun(diagnosis: Diagnosis) -> str:
