@@ -6,12 +6,12 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import quad
 from scipy.stats import binomtest, norm
 
 import gyromodel
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis import isolability
-from gyromodel.diagnosis._isolation import APART
 from gyromodel.model import GyroModel, ModelError, model_from_effects
 from tests.truth import study
 
@@ -38,6 +38,17 @@ def left(columns: np.ndarray, *taken: np.ndarray) -> float:
     return float(np.linalg.norm(rest)) / (N / np.sqrt(STEP))
 
 
+def taken(size: float, cosine: float, sine: float) -> float:
+    """The chance that a signal of some size (standard deviations) explains less than another: its part of the data is
+    drawn, then the other's beside it."""
+
+    def density(own: float) -> float:
+        beside = norm(cosine * own, sine)
+        return norm.pdf(own - size) * (beside.sf(abs(own)) + beside.cdf(-abs(own)))
+
+    return quad(density, -9.0, size + 9.0, epsabs=1e-10, limit=200, points=[0.0])[0]
+
+
 def test_sizes_are_those_of_least_squares_in_white_noise():
     """A ramp that turns: temperature against a drift and against a second voltage."""
     i = np.arange(300)
@@ -50,9 +61,9 @@ def test_sizes_are_those_of_least_squares_in_white_noise():
         ("bias_supply", "bias_temperature"),
     ):
         signal = {"bias_temperature": temperature, "bias_drift": drift, "bias_supply": voltage}
-        alike = np.sqrt(1.0 - (left(signal[a], one, signal[b]) / left(signal[a], one)) ** 2)
-        expected = 1.645 * np.sqrt(2.0 / (1.0 - alike)) / left(signal[a], one)
-        assert found.apart[a, b].value == pytest.approx(expected, rel=1e-6)
+        sine, size = left(signal[a], one, signal[b]) / left(signal[a], one), found.apart[a, b].value
+        assert taken(size * left(signal[a], one), np.sqrt(1.0 - sine**2), sine) == pytest.approx(0.05, rel=1e-6)
+        assert found.mistaken(a, b, -size) == pytest.approx(0.05)
     assert [found.detectable[k].unit for k in ("bias_temperature", "bias_drift")] == ["deg/h/degC", "deg/h/h"]
     # 4.3 standard deviations or a little more: the threshold with 80 %.
     needed = found.detectable["bias_temperature"].value * left(temperature, one)
@@ -77,17 +88,20 @@ def test_the_noise_and_the_scale_factor_must_be_stated():
 
 
 @pytest.mark.law
-def test_the_predicted_distance_is_the_measured_rate_of_confusion(rng: np.random.Generator):
-    """Two effects at a size where 20 % of campaigns should prefer the wrong one by least squares."""
+@pytest.mark.parametrize("standard_deviations", [0.7, 1.5, 4.0])
+def test_the_predicted_chance_is_the_measured_rate_of_confusion(standard_deviations: float, rng: np.random.Generator):
+    """Two effects, and how often least squares prefers the wrong one: down to sizes where its sign is in doubt."""
     i = np.arange(300)
     temperature = 20 + 0.1 * np.minimum(i, 500 - i)
     found = isolability(log(temperature), known_noise("bias"), tests=False)
-    size = found.apart["bias_temperature", "bias_drift"].value * -norm.ppf(0.2) / (APART / 2)
+    size = standard_deviations * found.std["bias_temperature"].value
+    predicted = found.mistaken("bias_temperature", "bias_drift", size)
     one, drift, wrong = np.ones(300), 1.0 * i, 0
     for _ in range(400):
         y = size * temperature + N / np.sqrt(STEP) * rng.standard_normal(300)
         wrong += left(y, one, drift) < left(y, one, temperature)
-    assert binomtest(int(wrong), 400, 0.2).pvalue > RARE
+    assert 0.02 < predicted < 0.49
+    assert binomtest(int(wrong), 400, predicted).pvalue > RARE
 
 
 @pytest.mark.long

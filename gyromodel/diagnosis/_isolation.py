@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.optimize import brentq
+from scipy.stats import norm
 
 from gyromodel._model_units import parameter_unit
 from gyromodel._noise_level import with_stated_level
@@ -27,8 +29,9 @@ from gyromodel.noise import NoiseRatios
 from gyromodel.signals import Record, read_signals, with_columns_known
 from gyromodel.units import factor, internal_unit
 
-# Two signals of one size, this many standard deviations apart, are taken for one another in 5 % of campaigns: Φ(−d/2).
-APART = 3.29
+# Two signals of one size, this many standard deviations apart, are taken for one another in 5 % of campaigns: Φ(−d/2),
+# where they are strong enough for the noise to leave their signs.
+MISTAKEN, APART = 0.05, 3.29
 # Added to the size that just reaches the threshold, so that noise leaves it there with 80 %.
 POWER = 0.84
 # Times of a step that stand for all, and the share of a signal that the model must leave.
@@ -200,12 +203,29 @@ class Isolability:
             never is.
         not_testable: effects that the campaign does not show, with the reason.
         tests: further tests, the most helpful first, each with `apart` as it is after it.
+        std: standard uncertainty of each effect's first parameter, were it alone.
+        cosine: by two effects, how much alike they are, whitened and beside the model; 1 where nothing parts them.
     """
 
     detectable: Mapping[str, Size]
     apart: Mapping[tuple[str, str], Size]
     not_testable: Mapping[str, str]
     tests: tuple[tuple[str, Mapping[tuple[str, str], Size]], ...]
+    std: Mapping[str, Size]
+    cosine: Mapping[tuple[str, str], float]
+
+    def mistaken(self, effect: str, rival: str, size: float) -> float:
+        """The chance that a rival fits better than the effect that is there.
+
+        Args:
+            effect: what is there.
+            rival: the other effect.
+            size: of the first, in the unit that `std` has.
+
+        Raises:
+            KeyError: one of them is not testable, or one is a special case of the other.
+        """
+        return _mistaken(abs(size) / self.std[effect].value, self.cosine[effect, rival])
 
     def closest(self, effect: str, apart: Mapping[tuple[str, str], Size] | None = None) -> tuple[str, Size] | None:
         """The effect that is hardest to tell from this one, and the size from which that is done; after a test too."""
@@ -245,16 +265,16 @@ def isolability(campaign: Campaign, model: GyroModel, *, tests: bool = True) -> 
     if not np.isfinite(float(model.gain())):
         raise ModelError("what can be told apart depends on the scale factor: state its value in the model")
     campaign = _output_known(campaign)
-    detectable, before, not_testable = _sizes([campaign], model)
+    now = _sizes([campaign], model)
     # Pairs that are not told apart at the size that shows them are what a further test is for.
-    in_doubt = [(a, b) for (a, b), size in before.items() if size.value > detectable[a].value]
+    in_doubt = [(a, b) for (a, b), size in now.apart.items() if size.value > now.detectable[a].value]
     helped = []
     for test in added_tests(campaign) if tests else ():
-        after = _sizes([campaign, _output_known(test.campaign, 1)], model)[1]
-        gained = sum(_nats(before[pair], after[pair]) for pair in in_doubt if pair in after)
+        after = _sizes([campaign, _output_known(test.campaign, 1)], model).apart
+        gained = sum(_nats(now.apart[pair], after[pair]) for pair in in_doubt if pair in after)
         helped.append((gained, test.sentence, after))
     helped.sort(key=lambda item: -item[0])
-    return Isolability(detectable, before, not_testable, tuple((sentence, after) for _, sentence, after in helped))
+    return replace(now, tests=tuple((sentence, after) for _, sentence, after in helped))
 
 
 def _nats(before: Size, after: Size) -> float:
@@ -262,10 +282,27 @@ def _nats(before: Size, after: Size) -> float:
     return float(np.log(min(before.value / after.value, MOST))) if np.isfinite(after.value) else 0.0
 
 
-def _sizes(
-    campaigns: Sequence[Campaign], model: GyroModel
-) -> tuple[dict[str, Size], dict[tuple[str, str], Size], dict[str, str]]:
-    """Sizes that are found, sizes that are told apart, and what is not testable."""
+def _mistaken(size: float, cosine: float) -> float:
+    """The chance that of two unit signals the one that is there fits worse: that its part of the data is the smaller.
+
+    Their parts differ by d in standard deviations and add up to s, independent of one another, and the larger is the
+    one whose difference and sum have one sign: Φ(−d/2) where the size leaves no doubt of the signs.
+    """
+    differ, add = size * np.sqrt((1.0 - cosine) / 2.0), size * np.sqrt((1.0 + cosine) / 2.0)
+    return float(norm.cdf(-differ) * norm.cdf(add) + norm.cdf(differ) * norm.cdf(-add))
+
+
+def _told_from(cosine: float) -> float:
+    """The size (standard deviations) from which an effect is told from one so much alike with 95 %; or infinite."""
+    each = float(np.sqrt(2.0 * max(1.0 - cosine, 0.0)))
+    if each <= VANISHED:
+        return np.inf
+    root: Any = brentq(lambda size: _mistaken(size, cosine) - MISTAKEN, 0.0, 2.0 * APART / each)
+    return float(root)
+
+
+def _sizes(campaigns: Sequence[Campaign], model: GyroModel) -> Isolability:
+    """What some campaigns can show, without further tests."""
     record = with_stated_level(with_columns_known(read_signals(campaigns))[0], model)
     model = model.prepared(record.signals)
     model = as_read(model, record, step_of(model, record))
@@ -304,19 +341,18 @@ def _sizes(
             return Size(distance / per_unit[name] / float(model.gain()) / factor("ppm", "1"), "ppm")
         return Size(distance / per_unit[name] * factor(internal_unit(unit), unit), unit)
 
-    detectable = {}
+    detectable, std = {}, {name: size(name, 1.0) for name in left}
     for name, columns in left.items():
         price = np.log(len(columns)) + bank.price(name)
         needed = explained_for(safe_threshold(nu) + price, nu, columns[0].shape[1])
         detectable[name] = size(name, float(np.sqrt(needed)) + POWER)
-    apart = {}
+    apart, cosine = {}, {}
     for a, b in itertools.permutations(left, 2):
         if a in forms[b][0].supersedes or b in forms[a][0].supersedes:
             continue
-        alike = np.median([max(_cosine(x, y) for y in bases[b]) for x in bases[a]])
-        each = float(np.sqrt(2.0 * max(1.0 - alike, 0.0)))
-        apart[a, b] = size(a, APART / each if each > VANISHED else np.inf)
-    return detectable, apart, not_testable
+        cosine[a, b] = float(np.median([max(_cosine(x, y) for y in bases[b]) for x in bases[a]]))
+        apart[a, b] = size(a, _told_from(cosine[a, b]))
+    return Isolability(detectable, apart, not_testable, (), std, cosine)
 
 
 def _per_unit(effects: Sequence[Effect], columns: Sequence[np.ndarray]) -> float:

@@ -12,8 +12,8 @@ from multiprocessing import get_context
 from typing import Any, TypeVar
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.special import logsumexp
-from scipy.stats import norm
 
 from . import contest
 from .campaigns import HOMES, LOOP, MOTION, RUNS, TESTABLE, UNCATALOGUED, A, B, C, Truth, hide, known
@@ -380,9 +380,10 @@ def confusion(seed: int, name: str, effect: str, rival: str, predicted: float, d
     stated = gyromodel.GyroModel(gyromodel.model_from_effects(names).effects, {"noise_white": noise.white})
     if "scale_factor" in names:
         stated = stated.with_vector(np.eye(len(names))[names.index("scale_factor")])
-    apart = gyromodel.isolability(campaign, stated, tests=False).apart[effect, rival]
-    larger = float(norm.isf(predicted) / norm.isf(0.05))
-    size = apart.value * factor(apart.unit, internal_unit(apart.unit)) * larger
+    planned = gyromodel.isolability(campaign, stated, tests=False)
+    apart = planned.apart[effect, rival]
+    size = brentq(lambda size: planned.mistaken(effect, rival, size) - predicted, 0.0, 4.0 * apart.value)
+    size *= factor(apart.unit, internal_unit(apart.unit))
     wrong, lost, listed = error(effect, design, size, {}), 0, 0
     for _ in range(draws):
         output = np.rad2deg(design.true["rate"] + wrong + noise.sample(design, rng))
