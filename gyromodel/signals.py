@@ -30,6 +30,8 @@ FINER_FROM = 4096
 JITTER = 0.05
 # A column missing in more than this share of the rows is not searched; rows without one of the others are left out.
 MOST_MISSING = 0.2
+# Stretches that are held out one by one, and may be power cycles.
+FEWEST_BLOCKS, MOST_BLOCKS = 4, 60
 
 
 def domain_of(output_unit: str) -> Domain:
@@ -117,13 +119,13 @@ def padded_length(rows: int) -> int:
 def _blocks(campaign: Campaign, time: np.ndarray) -> tuple[np.ndarray, str]:
     """Stretches that replicate the driver: runs between gaps, else the segment or run column, else equal parts."""
     stretches = stretches_of(time)
-    if 4 <= stretches.max() + 1 <= 60:
+    if FEWEST_BLOCKS <= stretches.max() + 1 <= MOST_BLOCKS:
         return stretches, "stretches between gaps"
     for name in NUMBERED:
         if name in campaign.columns:
             values = campaign.columns[name]
             numbers = np.unique(values, return_inverse=True)[1]
-            if 4 <= numbers.max() + 1 <= 60:
+            if FEWEST_BLOCKS <= numbers.max() + 1 <= MOST_BLOCKS:
                 return numbers, f"{name}s"
     parts = (np.arange(len(time)) * 5) // len(time)
     return parts, "fifths of the record"

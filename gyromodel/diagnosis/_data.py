@@ -18,15 +18,13 @@ from gyromodel.diagnosis._variance import steps_of_output, stretch_still, thermo
 from gyromodel.numerics.stretches import stretches_of
 from gyromodel.platform import GIMBALS, is_platform, vibration_record
 from gyromodel.poses import at_rest
-from gyromodel.signals import Record, columns_apart, read_signals, time_since_power_on
+from gyromodel.signals import MOST_BLOCKS, Record, columns_apart, read_signals, time_since_power_on
 from gyromodel.units import convertible
 
 # What a pose tells is in its mean: within it, means over so long (s) are enough, and keep out a hand's tremor.
 MEAN_OF_POSE = 1.0
 # Part of its range within which a column stands still in a stretch; stretches that may be runs, fewer than are dwells.
 STILL, MOST_STRETCHES = 0.1, 11
-# Gaps between more stretches than these are no power cycles.
-MOST_POWER_CYCLES = 60
 
 
 @dataclass(frozen=True)
@@ -149,7 +147,7 @@ def _since_gaps(record: Record, campaign: Campaign) -> Float[Array, " sample"] |
     """Time since power-on had the gyro been off in each gap; none without one, or with too many for power cycles."""
     time = np.asarray(record.signals["time"])
     stretch = stretches_of(time[: record.rows])
-    if not 0 < stretch.max() < MOST_POWER_CYCLES:
+    if not 0 < stretch.max() < MOST_BLOCKS:
         return None
     begins = time[np.searchsorted(stretch, np.arange(stretch.max() + 1))]
     since = time - np.pad(begins[stretch], (0, len(time) - record.rows), mode="edge")
