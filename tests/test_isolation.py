@@ -74,6 +74,7 @@ def test_sizes_are_those_of_least_squares_in_white_noise():
 def test_what_is_one_line_is_never_told_apart():
     found = isolability(log(20 + 0.1 * np.arange(200.0)), known_noise("bias"))
     assert found.apart["bias_temperature", "bias_drift"].value > 1e3 * found.detectable["bias_temperature"].value
+    assert found.mistaken("bias_temperature", "bias_drift", 5.0) == pytest.approx(0.5)
     sentence, after = found.tests[0]
     assert "temperature" in sentence
     assert after["bias_temperature", "bias_drift"].value < 2.0 * found.detectable["bias_temperature"].value

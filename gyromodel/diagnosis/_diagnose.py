@@ -151,12 +151,9 @@ def _diagnosed(
     if rounding.changed and (left_out := int(np.sum(record.present & ~session.record.present))):
         findings.append(f"{left_out} samples that stand apart from all others were left out beside rounding.")
     session, selection = over_angle_noise(session, selection, model, say) or (session, selection)
-    rival = None
-    if data.time_on is not None and (others := over_power_cycles(session, selection, data.time_on, model, say)):
-        # What a gyro that was never off has in its place.
-        rival = next((f.name for f in selection.found if f.follows), "smooth(time)")
-        session, selection = others
-        findings.append(TURNED_ON)
+    instead = ""
+    if data.time_on is not None and (off := over_power_cycles(session, selection, data.time_on, model, say)):
+        session, selection, instead = off
     if record.domain == "gyro" and (others := over_smooth_thermometers(session, selection, model, say)):
         session, selection = others
         findings.append(SMOOTHED)
@@ -251,8 +248,6 @@ def _diagnosed(
         beyond if baseline.noise_given else [c for c in beyond if c is hops],
         len(names),
     )
-    if rival:
-        judgement = undecided(judgement, "bias_warmup", rival, TELL_RUNS)
     coarse = rounding.changed or rounding.stuck or readings.coarse_beside(as_it_was, extended)
     if readings.untested and rounding.saw_tooth:
         findings.append("Campaigns are read in steps of their own: what is smaller than the coarsest may be rounding.")
@@ -279,9 +274,13 @@ def _diagnosed(
     if hops is not None:
         extended = stated_hops(extended, hops)
     next_test = judgement.next_test
-    if judgement.verdict == "ambiguous" and not rival:
+    if judgement.verdict == "ambiguous":
         alike = list(judgement.credible_set)
         next_test = settling_test(data.searched, baseline.model, extended, alike) or next_test
+    judgement = replace(judgement, next_test=next_test)
+    if instead and "bias_warmup" in extended.model.labels:
+        findings.append(TURNED_ON)
+        judgement = undecided(judgement, "bias_warmup", instead, TELL_RUNS)
     gain = not_measured(unit) if not hold_out else _gain(session, baseline, selection, unit, scale, weights, say)
     driver = driver_shape(session.scanner, selection, judgement.driver, unit) if judgement.driver else None
     say("done", 1.0)
@@ -302,7 +301,7 @@ def _diagnosed(
         causes=judgement.causes,
         driver=driver,
         gain=gain,
-        next_test=next_test,
+        next_test=judgement.next_test,
         minimum_detectable=sizes,
         not_testable=not_testable(session.scanner, selection.last, selection.estimate.model, sizes)
         | ({"quantisation": readings.untested} if readings.untested else {}),

@@ -203,7 +203,7 @@ class Isolability:
             never is.
         not_testable: effects that the campaign does not show, with the reason.
         tests: further tests, the most helpful first, each with `apart` as it is after it.
-        std: standard uncertainty of each effect's first parameter, were it alone.
+        std: size of each effect's first parameter that is one standard deviation of the noise, were it alone.
         cosine: by two effects, how much alike they are, whitened and beside the model; 1 where nothing parts them.
     """
 
@@ -215,7 +215,9 @@ class Isolability:
     cosine: Mapping[tuple[str, str], float]
 
     def mistaken(self, effect: str, rival: str, size: float) -> float:
-        """The chance that a rival fits better than the effect that is there.
+        """The chance that a rival fits better than the effect that is there, each in one form of one coefficient.
+
+        What has more forms fits noise better, and pays for it in a diagnosis.
 
         Args:
             effect: what is there.
@@ -233,7 +235,7 @@ class Isolability:
         return max(rivals.items(), key=lambda item: item[1].value) if rivals else None
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as plain data; a size that is never reached is null."""
+        """What `gyromodel plan` writes, as plain data; a size that is never reached is null."""
 
         def plain(size: Size) -> dict[str, Any]:
             return {"size": size.value if np.isfinite(size.value) else None, "unit": size.unit}
@@ -288,6 +290,8 @@ def _mistaken(size: float, cosine: float) -> float:
     Their parts differ by d in standard deviations and add up to s, independent of one another, and the larger is the
     one whose difference and sum have one sign: Φ(−d/2) where the size leaves no doubt of the signs.
     """
+    if cosine >= 1.0:
+        return 0.5
     differ, add = size * np.sqrt((1.0 - cosine) / 2.0), size * np.sqrt((1.0 + cosine) / 2.0)
     return float(norm.cdf(-differ) * norm.cdf(add) + norm.cdf(differ) * norm.cdf(-add))
 
@@ -350,7 +354,8 @@ def _sizes(campaigns: Sequence[Campaign], model: GyroModel) -> Isolability:
     for a, b in itertools.permutations(left, 2):
         if a in forms[b][0].supersedes or b in forms[a][0].supersedes:
             continue
-        cosine[a, b] = float(np.median([max(_cosine(x, y) for y in bases[b]) for x in bases[a]]))
+        alike = np.median([max(_cosine(x, y) for y in bases[b]) for x in bases[a]])
+        cosine[a, b] = min(float(alike), 1.0)
         apart[a, b] = size(a, _told_from(cosine[a, b]))
     return Isolability(detectable, apart, not_testable, (), std, cosine)
 

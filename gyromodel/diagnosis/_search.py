@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -279,13 +279,12 @@ def _beside_driver(steps: Steps, selection: Selection) -> Selection:
     estimates[-1] = selection.estimate
     # What was found before is one of these where it holds beside the function too.
     for i, step in [(i, f) for i, f in enumerate(found) if f.effect and f.name not in barred]:
-        rest = [*found[:i], *found[i + 1 :]]
-        if (without := steps.fit(rest)) is None:
-            continue
-        ranking = steps.rank_beside(without, rest, columns)
-        if ranking.statistic.get(step.name, -np.inf) >= steps.least(ranking, step.name) + more:
-            found[i] = replace(step, beside=driver, more=more, ranking=ranking)
-            path = [found[i] if f is step else f for f in path]
+        ranking = _beside_rest(steps, found, i, columns)
+        if ranking and ranking.statistic.get(step.name, -np.inf) >= steps.least(ranking, step.name) + more:
+            found[i] = replace(step, beside=driver, more=more)
+            # As it would have been added: beside what was there by then.
+            then = _beside_rest(steps, found[: i + 1], i, columns) if found[i + 1 :] else ranking
+            path = [replace(found[i], ranking=then or ranking) if f is step else f for f in path]
     marked = tuple(found)
     while len(path) < MAXIMUM_ROUNDS:
         ranking = steps.rank_beside(estimates[-1], found, columns)
@@ -298,17 +297,16 @@ def _beside_driver(steps: Steps, selection: Selection) -> Selection:
         if after is None or unresolved(after, step, scanner.step):
             break
         found, path, estimates = standing([*found, step]), [*path, step], [*estimates, after]
-    if len(path) == len(selection.path) and not any(f.beside for f in path):
+    added = path[len(selection.path) :]
+    if not added and not any(f.beside for f in found):
         return selection
     last = steps.rank(estimates[-1], found)
     if significant_driver(last, steps.threshold) != driver:
         return selection
     as_before = [*map(id, found[: len(marked)])] == [*map(id, marked)]
     left_out = dict(selection.left_out) if as_before else {}
-    for i in [i for i, f in enumerate(found) if f.beside and len(found) > 1]:
-        rest = [*found[:i], *found[i + 1 :]]
-        fitted = steps.fit(rest)
-        left_out[i] = steps.rank_beside(fitted, rest, columns) if fitted else found[i].ranking
+    for i in [i for i, f in enumerate(found) if f.beside]:
+        left_out[i] = _beside_rest(steps, found, i, columns) or found[i].ranking
     return replace(
         selection,
         estimate=estimates[-1],
@@ -317,9 +315,16 @@ def _beside_driver(steps: Steps, selection: Selection) -> Selection:
         last=last,
         estimates=tuple(estimates),
         left_out=left_out,
-        remains="" if selection.remains in {f.name for f in found if f.beside} else selection.remains,
+        remains="" if selection.remains in {f.name for f in added} else selection.remains,
         alone=selection.first,
     )
+
+
+def _beside_rest(steps: Steps, found: Sequence[Found], i: int, columns: np.ndarray) -> Ranking | None:
+    """All candidates beside further columns and all that was found but one; none where that has no fit."""
+    rest = [*found[:i], *found[i + 1 :]]
+    without = steps.fit(rest)
+    return steps.rank_beside(without, rest, columns) if without else None
 
 
 def _once(scanner: Scanner, driver: str) -> bool:

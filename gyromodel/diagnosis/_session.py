@@ -163,10 +163,10 @@ def over_unrounded(
 
 def over_power_cycles(
     session: Session, selection: Selection, time_on: Float[Array, " sample"], model: GyroModel, say: Progress
-) -> tuple[Session, Selection] | None:
+) -> tuple[Session, Selection, str] | None:
     """The search as if the gyro had been off in every gap, where a warm-up after each explains the data better.
 
-    Not where structure is left that has no name: what is unknown stays so.
+    And what a gyro that never was off has in the warm-up's place.
 
     Args:
         session: the search as if it never had been.
@@ -175,8 +175,6 @@ def over_power_cycles(
         model: the simulation.
         say: progress.
     """
-    if selection.unfinished:
-        return None
     record = session.record._replace(signals=session.record.signals | {"time_on": time_on})
     try:
         off = laid_out(
@@ -185,15 +183,21 @@ def over_power_cycles(
     except EstimateError:
         return None
     # Nothing else asks when the gyro was turned on.
-    if "bias_warmup" in model.labels:
-        better = off.steps.fits_better((), (), EXCHANGE, session.steps)
-        return (off, off.run(say)) if better else None
-    if off.steps.rank(off.baseline, []).statistic.get("bias_warmup", -np.inf) < off.threshold:
+    simulated = "bias_warmup" in model.labels
+    if simulated and not off.steps.fits_better((), (), EXCHANGE, session.steps):
+        return None
+    if not simulated and off.steps.rank(off.baseline, []).statistic.get("bias_warmup", -np.inf) < off.threshold:
         return None
     other = off.run(say)
-    ahead = EXCHANGE + selection.followed - other.followed
-    warms = any(f.name == "bias_warmup" for f in other.found)
-    return (off, other) if warms and off.steps.fits_better(other.found, selection.found, ahead, session.steps) else None
+    own = {f.name for f in other.found}
+    left = max(selection.followed, selection.last.statistic.get(selection.remains, 0.0))
+    ahead = EXCHANGE + left - other.followed
+    if not (simulated or "bias_warmup" in own):
+        return None
+    if not off.steps.fits_better(other.found, selection.found, ahead, session.steps):
+        return None
+    instead = [f.name for f in selection.found if f.follows and f.name not in own]
+    return off, other, selection.driver or next(iter(instead), "smooth(time)")
 
 
 def over_smooth_thermometers(

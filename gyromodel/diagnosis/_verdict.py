@@ -300,14 +300,17 @@ def structured(judgement: Judgement, ranking: Ranking, column: str) -> Judgement
 
 def undecided(judgement: Judgement, name: str, rival: str, test: str) -> Judgement:
     """The judgement where what was found as `name` may as well be `rival`, until a test tells."""
-    if judgement.verdict == "unknown" or all(c.effect != name for c in judgement.causes):
+    cause = next((c for c in judgement.causes if c.effect == name), None)
+    if cause is None or judgement.verdict not in ("named", "ambiguous"):
         return judgement
-    others = judgement.credible_set if judgement.verdict == "ambiguous" else {}
-    shares = {name: 0.5, rival: 0.5} | {k: v for k, v in others.items() if k not in (name, rival)}
-    shares = {k: v / sum(shares.values()) for k, v in shares.items()}
-    cause = next(c for c in judgement.causes if c.effect == name)
-    pair = _as_set(replace(cause, posterior=shares[name]), shares)
-    rest = tuple(c for c in judgement.causes if c.effect not in shares)
+    if judgement.verdict == "ambiguous":
+        # What else is in doubt stays the set.
+        return replace(judgement, next_test=" ".join(filter(None, (judgement.next_test, test))))
+    shares = {name: 0.5, rival: 0.5}
+    # A function of a column is no cause with a name.
+    members = {k: v for k, v in shares.items() if not is_driver(k)}
+    pair = _as_set(replace(cause, posterior=0.5), members)
+    rest = tuple(c for c in judgement.causes if c.effect not in members)
     return replace(judgement, verdict="ambiguous", causes=(*pair, *rest), credible_set=shares, next_test=test)
 
 
