@@ -229,12 +229,13 @@ def _together(
 ) -> list[tuple[Found, Estimate]]:
     """Two candidates, none barred, that are significant together, with their fits; none: there are no such.
 
-    Where another is significant alone, the two are to do better than it by the odds of a further cause.
+    Where another is significant alone, the two are to do better than it by the odds of a further cause, and by more than
+    it may lose for its shape.
     """
     pair, score = best_pair(steps.scanner, ranking, barred)
     if pair is None or score < max(steps.least(ranking, name) for name in pair):
         return []
-    if alone and (alone in pair or score < ranking.statistic[alone] + FURTHER):
+    if alone and (alone in pair or score < (1.0 + BETWEEN) * ranking.statistic[alone] + FURTHER):
         return []
     one = replace(steps.step(path, estimate, ranking, pair[0]), paired=True)
     first = steps.fit(standing([*path, one]))
