@@ -30,6 +30,9 @@ MAXIMUM_STEPS = 3
 MOST_TAKEN = 0.25
 # Rank correlation with time from which on a column goes one way.
 ONE_WAY = 0.95
+# A driver with more than this part of the strongest name's evidence makes what is wrong unknown: names that follow one
+# another never end it.
+UNKNOWN_EVIDENCE = 0.25
 # Powers of a driver's values that are taken out beside names.
 POWERS = 3
 # Nats that a further cause needs more than the first: of something wrong one cause is likelier than two.
@@ -229,8 +232,8 @@ def _together(
 ) -> list[tuple[Found, Estimate]]:
     """Two candidates, none barred, that are significant together, with their fits; none: there are no such.
 
-    Where another is significant alone, the two are to do better than it by the odds of a further cause, and by more than
-    it may lose for its shape.
+    Where another is significant alone, the two are to do better than it by the odds of a further cause, and by what it
+    may lose for its shape.
     """
     pair, score = best_pair(steps.scanner, ranking, barred)
     if pair is None or score < max(steps.least(ranking, name) for name in pair):
@@ -279,14 +282,17 @@ def _beside_driver(steps: Steps, selection: Selection) -> Selection:
     found, path, estimates = list(selection.found), list(selection.path), list(selection.estimates)
     estimates[-1] = selection.estimate
     # What was found before is one of these where it holds beside the function too.
-    for i, step in [(i, f) for i, f in enumerate(found) if f.effect and f.name not in barred]:
+    strongest = max((f.ranking.statistic.get(f.name, 0.0) for f in found), default=0.0)
+    unknown = selection.last.statistic[driver] > UNKNOWN_EVIDENCE * strongest
+    for i, step in [(i, f) for i, f in enumerate(found) if unknown and f.effect and f.name not in barred]:
         ranking = _beside_rest(steps, found, i, columns)
         if ranking and ranking.statistic.get(step.name, -np.inf) >= steps.least(ranking, step.name) + more:
-            found[i] = replace(step, beside=driver, more=more)
+            # It needs no more than it did, and is judged by its own rankings.
+            found[i] = replace(step, beside=driver)
             # As it would have been added: beside what was there by then.
             then = _beside_rest(steps, found[: i + 1], i, columns) if found[i + 1 :] else ranking
             path = [replace(found[i], ranking=then or ranking) if f is step else f for f in path]
-    marked = tuple(found)
+    before = tuple(found)
     while len(path) < MAXIMUM_ROUNDS:
         ranking = steps.rank_beside(estimates[-1], found, columns)
         noises = (k for k in ranking.statistic if is_noise(k))
@@ -304,9 +310,9 @@ def _beside_driver(steps: Steps, selection: Selection) -> Selection:
     last = steps.rank(estimates[-1], found)
     if significant_driver(last, steps.threshold) != driver:
         return selection
-    as_before = [*map(id, found[: len(marked)])] == [*map(id, marked)]
+    as_before = [*map(id, found[: len(before)])] == [*map(id, before)]
     left_out = dict(selection.left_out) if as_before else {}
-    for i in [i for i, f in enumerate(found) if f.beside]:
+    for i in [i for i, f in enumerate(found) if any(f is step for step in added)]:
         left_out[i] = _beside_rest(steps, found, i, columns) or found[i].ranking
     return replace(
         selection,

@@ -20,7 +20,7 @@ from gyromodel.diagnosis._result import CREDIBLE, VAGUE, Cause, ParameterValue, 
 from gyromodel.diagnosis._rounded import curve_of_rounding, no_farther, no_larger, of_rounding
 from gyromodel.diagnosis._said import places, told, told_of_cause, told_of_driver, told_of_rest
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._search import Selection
+from gyromodel.diagnosis._search import UNKNOWN_EVIDENCE, Selection
 from gyromodel.diagnosis._shapes import remaining
 from gyromodel.diagnosis._steps import Found, Steps
 from gyromodel.effects._shapes import beyond_earth
@@ -38,8 +38,6 @@ FAINT, OUTDONE = 10.0, 10.0
 CODES = "bias_readout_code"
 # A driver that names leave with more than this share of the structure makes the discrepancy unknown.
 UNKNOWN_SHARE = 0.05
-# So does one with more than this part of the strongest name's evidence: names that follow one another never end it.
-UNKNOWN_EVIDENCE = 0.25
 
 
 @dataclass(frozen=True)
@@ -147,10 +145,6 @@ def judge(
         )
         driver = None
     findings += told_of_driver(scanner, selection, driver) if driver else ()
-    if driver and any(f.beside for f in selection.found):
-        findings.append(
-            "Sizes of names beside it are fitted with what has no name as noise, as their uncertainties say."
-        )
     unexplained = {" and ".join(smooth_columns(driver)): share} if driver else {}
 
     def judged(verdict: Verdict, causes: Sequence[Cause], credible: dict[str, float], **more: str | None) -> Judgement:
@@ -161,6 +155,10 @@ def judge(
     effects = [c for c in causes if scanner.by_points or c.effect != "outliers"]
     strongest = max((c.statistic for c in effects), default=0.0)
     if driver and (share > UNKNOWN_SHARE or last.statistic[driver] > UNKNOWN_EVIDENCE * strongest):
+        if any(f.beside for f in selection.found):
+            findings.append(
+                "Sizes of names beside it are fitted with what has no name as noise, as their uncertainties say."
+            )
         return judged("unknown", causes, {driver: 1.0}, driver=driver, next_test=_test_of_driver(driver))
     if not saw_tooth and _outweighed(effects, selection, scanner.record.domain):
         # A name holds less of what is there than it leaves, in a form that it cannot have; or all of them do.
