@@ -36,11 +36,11 @@ from gyromodel.diagnosis._evidence import (
     safe_threshold,
 )
 from gyromodel.diagnosis._forms import step_at
+from gyromodel.diagnosis._judgement import Judgement, as_set, undecided
 from gyromodel.diagnosis._pairs import best_pair
 from gyromodel.diagnosis._ranking import rank, special_cases
 from gyromodel.diagnosis._said import _in_campaign, places
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._verdict import _as_set
 from gyromodel.effects.drivers import BiasPeriodic
 from gyromodel.effects.thermal import BiasWarmup
 from gyromodel.estimate import EstimateError, fit_record
@@ -845,10 +845,26 @@ def test_a_compensated_output_is_no_driver(rng: np.random.Generator) -> None:
 def test_a_rival_ahead_of_all_numbers_has_a_finite_evidence():
     """Of a share that underflows only a bound is known."""
     cause = Cause("bias", (), 10.0, 0.0, 0.0, 0.0)
-    both = _as_set(cause, {"bias": 0.0, "bias_drift": 1.0})
+    both = as_set(cause, {"bias": 0.0, "bias_drift": 1.0})
     assert [c.effect for c in both] == ["bias", "bias_drift"]
     assert 700 < both[1].statistic - cause.statistic < 800
-    assert _as_set(cause, {"bias": 0.25, "bias_drift": 0.75})[1].statistic == pytest.approx(10.0 + np.log(3.0))
+    assert as_set(cause, {"bias": 0.25, "bias_drift": 0.75})[1].statistic == pytest.approx(10.0 + np.log(3.0))
+
+
+def test_what_may_be_another_stays_beside_what_is_in_doubt_itself() -> None:
+    """One verdict has one set: a second doubt is told of, and is no firm name."""
+    warm, line, curve = (Cause(k, (), 50.0, 0.0, 0.0, p) for k, p in (("bias_warmup", 1.0), ("b", 0.6), ("c", 0.4)))
+    alone = Judgement("named", (warm, line), {"bias_warmup": 1.0}, None, None, {}, ())
+    told = undecided(alone, "bias_warmup", "smooth(time)", "Switch it off.")
+    assert (told.verdict, told.credible_set) == ("ambiguous", {"bias_warmup": 0.5, "smooth(time)": 0.5})
+    assert [(c.effect, c.posterior) for c in told.causes] == [("bias_warmup", 0.5), ("b", 0.6)]
+    doubted = Judgement("ambiguous", (line, curve, warm), {"b": 0.6, "c": 0.4}, None, "Ramp.", {}, ())
+    told = undecided(doubted, "bias_warmup", "smooth(time)", "Switch it off.")
+    assert (told.causes, told.credible_set) == ((line, curve), doubted.credible_set)
+    assert told.next_test == "Ramp. Switch it off."
+    assert "bias_warmup or smooth(time)" in told.findings[0]
+    unknown = Judgement("unknown", (warm,), {"smooth(time)": 1.0}, "smooth(time)", None, {}, ())
+    assert undecided(unknown, "bias_warmup", "smooth(time)", "Switch it off.") is unknown
 
 
 def test_a_bias_that_follows_the_product_of_two_other_columns_is_no_adequate_model(rng: np.random.Generator) -> None:

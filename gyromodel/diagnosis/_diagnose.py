@@ -18,6 +18,7 @@ from gyromodel.diagnosis._extended import finished, stated_counts, stated_hops, 
 from gyromodel.diagnosis._gain import nested_gain, no_gain, not_measured, with_predictable_blocks
 from gyromodel.diagnosis._intervals import CLEARER, COUNTED, HALF, over_intervals
 from gyromodel.diagnosis._isolation import settling_test
+from gyromodel.diagnosis._judgement import structured, undecided, with_noise, with_steps
 from gyromodel.diagnosis._misfit import excess_band, unexplained_axes
 from gyromodel.diagnosis._noise_causes import as_cause, quantisation, telegraph
 from gyromodel.diagnosis._points import dwells_apart
@@ -36,7 +37,7 @@ from gyromodel.diagnosis._session import (
 )
 from gyromodel.diagnosis._shapes import driver_shape, minimum_detectable, not_testable
 from gyromodel.diagnosis._variance import follow, growing_noise, noise_level, tails
-from gyromodel.diagnosis._verdict import FAINT, judge, structured, undecided, with_noise, with_steps
+from gyromodel.diagnosis._verdict import FAINT, judge
 from gyromodel.estimate import (
     Estimate,
     EstimateError,

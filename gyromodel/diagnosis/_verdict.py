@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from gyromodel.diagnosis._apart import like, twins
 from gyromodel.diagnosis._causes import cause_of
 from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._exchange import uncontested
+from gyromodel.diagnosis._judgement import Judgement, also_held, as_set
 from gyromodel.diagnosis._points import levels
 from gyromodel.diagnosis._ranking import SLOW_IN_TIME, TIME_MARGIN, Ranking, is_driver, is_noise, special_cases
 from gyromodel.diagnosis._result import CREDIBLE, VAGUE, Cause, ParameterValue, Verdict
@@ -38,19 +39,6 @@ FAINT, OUTDONE = 10.0, 10.0
 CODES = "bias_readout_code"
 # A driver that names leave with more than this share of the structure makes the discrepancy unknown.
 UNKNOWN_SHARE = 0.05
-
-
-@dataclass(frozen=True)
-class Judgement:
-    """A verdict with everything that goes with it."""
-
-    verdict: Verdict
-    causes: tuple[Cause, ...]
-    credible_set: dict[str, float]
-    driver: str | None
-    next_test: str | None
-    unexplained: dict[str, float]
-    findings: tuple[str, ...]
 
 
 def credible(
@@ -172,17 +160,13 @@ def judge(
         return judged("adequate", (), {})
     for cause, members in zip(causes[1:], sets[1:], strict=True):
         if len(members) > 1:
-            others = " or ".join(members)
-            findings.append(
-                f"The extended model also holds {cause.effect}, which this campaign cannot tell from the others of: "
-                f"{others}."
-            )
+            findings.append(also_held(cause.effect, members))
     named = [c for c, s in zip(causes, sets, strict=True) if len(s) == 1]
     if len(sets[0]) == 1:
         return judged("named", named, sets[0])
     firm = [c for c in named if c.effect not in sets[0]]
     test = _next_test(list(sets[0]), scanner.record, causes[0])
-    return judged("ambiguous", (*_as_set(causes[0], sets[0]), *firm), sets[0], next_test=test)
+    return judged("ambiguous", (*as_set(causes[0], sets[0]), *firm), sets[0], next_test=test)
 
 
 def _ranking_of(steps: Steps, selection: Selection, i: int) -> Ranking:
@@ -286,85 +270,6 @@ def _fitted(cause: Cause) -> list[ParameterValue]:
 
 def _sized(parameter: ParameterValue) -> bool:
     return bool(0.0 < VAGUE * parameter.std < abs(parameter.value))
-
-
-def structured(judgement: Judgement, ranking: Ranking, column: str) -> Judgement:
-    """The judgement where what passes for noise at one end of a column has a structure that nothing searched has."""
-    name = f"smooth({column})"
-    driver = name if name in ranking.statistic else None
-    test = f"Repeat the campaign over that end of {column} alone, sampled more densely: what returns there is no noise."
-    return replace(judgement, verdict="unknown", credible_set={name: 1.0}, driver=driver, next_test=test)
-
-
-def undecided(judgement: Judgement, name: str, rival: str, test: str) -> Judgement:
-    """The judgement where what was found as `name` may as well be `rival`, until a test tells."""
-    cause = next((c for c in judgement.causes if c.effect == name), None)
-    if cause is None or judgement.verdict not in ("named", "ambiguous"):
-        return judgement
-    if judgement.verdict == "ambiguous":
-        # What else is in doubt stays the set.
-        return replace(judgement, next_test=" ".join(filter(None, (judgement.next_test, test))))
-    shares = {name: 0.5, rival: 0.5}
-    # A function of a column is no cause with a name.
-    members = {k: v for k, v in shares.items() if not is_driver(k)}
-    pair = _as_set(replace(cause, posterior=0.5), members)
-    rest = tuple(c for c in judgement.causes if c.effect not in members)
-    return replace(judgement, verdict="ambiguous", causes=(*pair, *rest), credible_set=shares, next_test=test)
-
-
-def with_steps(judgement: Judgement, steps: Cause) -> Judgement:
-    """The judgement with steps of the output beside what else the simulation lacks."""
-    if judgement.verdict == "adequate":
-        return replace(judgement, verdict="named", causes=(steps,), credible_set={steps.effect: 1.0})
-    if judgement.verdict == "named":
-        return replace(judgement, causes=tuple(sorted((*judgement.causes, steps), key=lambda c: -c.statistic)))
-    others = tuple(c for c in judgement.causes if c.effect != steps.effect)
-    return replace(judgement, causes=(*others, steps))
-
-
-def with_noise(judgement: Judgement, beyond: Sequence[Cause], trials: int) -> Judgement:
-    """The judgement with kinds of noise that the simulation lacks beside what else it lacks."""
-    if not beyond:
-        return judgement
-    beyond = [replace(c, p_adjusted=min(1.0, c.p_value * trials)) for c in beyond]
-    regular = [c for c in beyond if c.posterior < 1.0]
-    if regular:
-        # Hops at a regular pace, which something that switches makes as well.
-        rival = Cause("bias_periodic", (), regular[0].statistic, regular[0].p_value, regular[0].p_adjusted, 0.5)
-        others = [c for c in beyond if c not in regular]
-        test = "Log again with what switches nearby (chamber, heater, pump) off: hops of the gyro itself go on."
-        shares = {c.effect: c.posterior for c in (*regular, rival)}
-        return replace(
-            judgement,
-            verdict="ambiguous",
-            causes=(*regular, rival, *judgement.causes, *others),
-            credible_set=shares,
-            next_test=test,
-        )
-    if judgement.verdict == "adequate":
-        judgement = replace(judgement, verdict="named", credible_set={beyond[0].effect: 1.0})
-    causes = (*judgement.causes, *beyond)
-    if judgement.verdict == "named":
-        causes = tuple(sorted(causes, key=lambda c: -c.statistic))
-    return replace(judgement, causes=causes)
-
-
-def _as_set(cause: Cause, members: dict[str, float]) -> tuple[Cause, ...]:
-    # A share may be too small for a number.
-    share = {k: max(v, np.finfo(float).tiny) for k, v in members.items()}
-    others = [
-        Cause(
-            k,
-            (),
-            cause.statistic + float(np.log(share[k]) - np.log(share.get(cause.effect, share[k]))),
-            cause.p_value,
-            cause.p_adjusted,
-            v,
-        )
-        for k, v in members.items()
-        if k != cause.effect
-    ]
-    return (cause, *others)
 
 
 def _unrepeated(scanner: Scanner, bad: np.ndarray) -> bool:
