@@ -71,7 +71,7 @@ def diagnose_axes(
     lie = None
     try:
         lie = None if unknown else triad(measured, extended)
-    except (EstimateError, ModelError) as error:
+    except (CampaignError, EstimateError, ModelError) as error:
         said.append(
             "How the axes lie together is not told: an axis cannot be fitted with leans beside what it lacks: "
             + f"{str(error).rstrip('.')}."

@@ -194,7 +194,10 @@ def _with_own_leans(
         # Rates of an attitude are missing in some of its rows.
         rows = np.isin(campaigns[k].columns["time"], rated[k].columns["time"])
         for m in np.flatnonzero(square > 1e-12 * max(square[-1], 1e-300)):
-            names.append(f"lean_{k + 1}_{m + 1}")
+            taken, name = {n for c in with_them for n in c.columns}, f"lean_{k + 1}_{m + 1}"
+            while name in taken:
+                name += "_"
+            names.append(name)
             its = np.full(len(rows), np.nan)
             its[rows] = cross @ directions[:, m]
             with_them = [

@@ -346,8 +346,10 @@ def _once(scanner: Scanner, driver: str) -> bool:
     def one_way(values: np.ndarray) -> bool:
         seen = present & np.isfinite(values)
         parts = [seen & (run == r) for r in np.unique(run[seen])]
-        each = (np.corrcoef(rankdata(time[p]), rankdata(values[p]))[0, 1] for p in parts if p.sum() > 2)
-        return all(abs(correlation) > ONE_WAY for correlation in each)
+        # A run in which it stands still, or of two rows, says nothing.
+        told = [p for p in parts if p.sum() > 2 and np.ptp(values[p]) > 0.0]
+        each = [np.corrcoef(rankdata(time[p]), rankdata(values[p]))[0, 1] for p in told]
+        return bool(told) and all(abs(correlation) > ONE_WAY for correlation in each)
 
     alone = {f"smooth({name})" for name in names}
     values = {b.name: np.asarray(b.along)[rows] for b in scanner.bank.blocks if b.name in alone and b.along is not None}
