@@ -25,10 +25,10 @@ from tests.truth.study import SLOW
 from tests.truth.verdicts import ACCEPTED, Answer, judge
 
 # Engine calls, each some seconds.
-NULLS, MOVING, STRANGE = 24, 6, 6  # in noise of the family, the same on the move, in other noise anywhere
+NULLS, MOVING, STRANGE = 40, 10, 10  # in noise of the family, the same on the move, in other noise anywhere
 NAMES = len({e for d in HOMES for e in TESTABLE[d]})
-EFFECTS_1, EFFECTS_3, EFFECTS_10 = 12, 36, 10  # other effects each run
-UNKNOWN_3, UNKNOWN_10 = 12, 6  # of 8 uncatalogued effects
+EFFECTS_1, EFFECTS_3, EFFECTS_10 = 20, 60, 20  # other effects each run
+UNKNOWN_3, UNKNOWN_10 = 16, 8  # of 8 uncatalogued effects
 RETRIES = 5  # further draws of an effect that was missed once
 WORKERS = 1 if "PYTEST_XDIST_WORKER" in os.environ else 2
 
