@@ -13,9 +13,8 @@ import pytest
 
 import gyromodel as gm
 from gyromodel.declarations import declarations
-from gyromodel.effects.drivers import Bias, BiasPeriodic
-from gyromodel.effects.thermal import BiasTemperatureCurve
-from tests.truth import fiber_optic, study
+from gyromodel.effects.drivers import BiasPeriodic
+from tests.truth import study
 from tests.truth.campaigns import HOMES, TESTABLE, UNCATALOGUED
 from tests.truth.designs import DESIGNS
 from tests.truth.memory import on_a_case, two_nodes
@@ -96,21 +95,6 @@ def test_what_is_hidden_is_named_and_nothing_else(design: str, effect: str):
     answer = study.run_case(study.Case(EXAMPLE, design, "white", effect, 10.0)).answer
     assert answer is not None
     assert (answer.verdict, set(answer.causes)) == ("named", set(effect.split("+")))
-
-
-@pytest.mark.long
-def test_a_changing_gradient_is_named():
-    """Case and coil of a fiber-optic gyro, heat diffusing in, a bias while the difference between them changes."""
-    log = fiber_optic.log(fiber_optic.Gyro(gradient_rate=4000.0), 3.0, np.random.default_rng(EXAMPLE))
-    means = {k: log[k].reshape(-1, 20).mean(axis=1) for k in ("time", "temperature", "temperature_coil", "output")}
-    means["output"] /= fiber_optic.SCALE_FACTOR
-    units = {"time": "s", "temperature": "degC", "temperature_coil": "degC", "output": "deg/h"}
-    campaign = gm.Campaign(means, units, {"kind": "rate"})
-    bends = np.array(fiber_optic.BREAKPOINTS)
-    curve = BiasTemperatureCurve(coefficients=np.zeros(1), hinges=np.zeros(2), breakpoints=bends)  # type: ignore[arg-type]
-    known = frozenset({("bias_temperature_curve", "breakpoints")})
-    found = gm.diagnose(campaign, gm.GyroModel((Bias(), curve), fixed=known), hold_out=False)
-    assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["bias_temperature_gradient_rate"])
 
 
 @pytest.mark.long

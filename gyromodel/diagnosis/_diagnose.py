@@ -36,6 +36,7 @@ from gyromodel.diagnosis._session import (
     without_axis,
 )
 from gyromodel.diagnosis._shapes import driver_shape, minimum_detectable, not_testable
+from gyromodel.diagnosis._thermometers import within_thermometers
 from gyromodel.diagnosis._variance import follow, growing_noise, noise_level, tails
 from gyromodel.diagnosis._verdict import FAINT, judge
 from gyromodel.estimate import (
@@ -48,7 +49,7 @@ from gyromodel.estimate import (
     with_reading,
 )
 from gyromodel.model import GyroModel
-from gyromodel.signals import with_columns_known
+from gyromodel.signals import Record, with_columns_known
 from gyromodel.units import factor, from_internal
 
 FEWEST_DRAWS = 200
@@ -155,8 +156,9 @@ def _diagnosed(
     instead = ""
     if data.time_on is not None and (off := over_power_cycles(session, selection, data.time_on, model, say)):
         session, selection, instead = off
-    if record.domain == "gyro" and (others := over_smooth_thermometers(session, selection, model, say)):
-        session, selection = others
+    smoothed = over_smooth_thermometers(session, selection, model, say) if record.domain == "gyro" else None
+    if smoothed:
+        session, selection = smoothed
         findings.append(SMOOTHED)
     beyond: list[Cause] = []
     # What rounding leaves is larger at edges of steps, where there is much more to tell than tails.
@@ -176,6 +178,7 @@ def _diagnosed(
         else:
             ratio = ParameterValue("ratio", grows.ratio, grows.ratio_std, "1")
             beyond.append(as_cause("noise_heteroscedastic", grows.evidence, ratio))
+    selection = within_thermometers(session, selection, record)
     if record.domain == "platform" and selection.found and (failed := unexplained_axes(selection.estimate)):
         moves = f"the base moves about {listed(failed)} as nothing in the catalogue makes it"
         others = without_axis(measured, failed[0], model, session.threshold, say)
@@ -282,7 +285,11 @@ def _diagnosed(
     if instead and "bias_warmup" in extended.model.labels:
         findings.append(TURNED_ON)
         judgement = undecided(judgement, "bias_warmup", instead, TELL_RUNS)
-    gain = not_measured(unit) if not hold_out else _gain(session, baseline, selection, unit, scale, weights, say)
+    gain = (
+        not_measured(unit)
+        if not hold_out
+        else _gain(session, baseline, selection, as_it_was, unit, scale, weights, say)
+    )
     driver = driver_shape(session.scanner, selection, judgement.driver, unit) if judgement.driver else None
     say("done", 1.0)
     rankings = [*(f.ranking for f in selection.path), selection.last]
@@ -380,7 +387,17 @@ def _like_hops(selection: Selection, free: Estimate) -> bool:
     return in_time and selection.driver in (None, "smooth(time)") and (slow or bool(selection.found))
 
 
-def _gain(session: Session, baseline: Estimate, selection: Selection, unit: str, scale: float, ordinary, say) -> Gain:
+def _gain(
+    session: Session,
+    baseline: Estimate,
+    selection: Selection,
+    measured: Record,
+    unit: str,
+    scale: float,
+    ordinary: tuple[bool, bool],
+    say: Callable[[str, float], None],
+) -> Gain:
+    """The gain on blocks left out; `measured` is the record with temperatures as they were read."""
     if not any(f.effect is not None or f.frees_noise for f in selection.found):
         return no_gain(session.record, session.ladder(baseline)[0] * scale, unit)
 
@@ -389,7 +406,8 @@ def _gain(session: Session, baseline: Estimate, selection: Selection, unit: str,
     cells = sorted({g for ranking in rankings for g in cells_of_weight(ranking, FOLD_NEARBY)})
 
     def select(rows: np.ndarray, base: Estimate) -> Estimate:
-        return Session(session.scanner.without(rows, cells), base, session.threshold).run(noise=noise).estimate
+        fold = Session(session.scanner.without(rows, cells), base, session.threshold)
+        return within_thermometers(fold, fold.run(noise=noise), measured).estimate
 
     return nested_gain(
         session.record,

@@ -249,7 +249,14 @@ def _together(
         return []
     other = steps.step([*path, one], first, ranking, pair[1])
     both = steps.fit(standing([*path, one, other]))
-    return [] if both is None or not steps.keeps(first, other, both) else [(one, first), (other, both)]
+    if both is None or not steps.keeps(first, other, both):
+        return []
+    # Of what takes an earlier one's place, the evidence is what it explains without that.
+    after, least = [*path, one, other], steps.least(ranking, other.name) + FURTHER
+    replaces = len(standing(after)) < len(after)
+    if replaces and path and not steps.fits_better(standing(after), standing(path), least):
+        return []
+    return [(one, first), (other, both)]
 
 
 def significant_driver(ranking: Ranking, threshold: float) -> str | None:

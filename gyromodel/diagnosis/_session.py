@@ -218,8 +218,8 @@ def over_smooth_thermometers(
         return None
     other = smooth.run(say)
     some = other.found or selection.found
-    # What only follows a column was found too, if not named.
-    ahead = EXCHANGE + selection.followed - other.followed
+    # What only followed a column was found too, if not named; what smooth records leave to follow one is no gain.
+    ahead = EXCHANGE + max(selection.followed - other.followed, 0.0)
     better = some and smooth.steps.fits_better(other.found, selection.found, ahead, session.steps)
     return (smooth, other) if better else None
 

@@ -152,12 +152,12 @@ class Steps:
         bank = self.scanner.bank
         price = {k: np.log(max(bank.structures(k), 1)) + bank.price(k) for k in fits}
         held = {k: fit for k, fit in fits.items() if fit and not any(e.beyond_reach for e in fit.model.effects)}
-        quality = {k: _quality(fit) - price[k] for k, fit in held.items()}
+        told = {k: quality(fit) - price[k] for k, fit in held.items()}
         before = self.fit([*found, given_up])
-        if name not in quality or before is None:
+        if name not in told or before is None:
             return ranking
-        own = max(score, quality[name] - _quality(before))
-        told = {k: own + v - quality[name] for k, v in quality.items()}
+        own = max(score, told[name] - quality(before))
+        told = {k: own + v - told[name] for k, v in told.items()}
         if driver < score and all(v < ranking.statistic[k] + EXCHANGE for k, v in told.items()):
             return ranking
         return replace(ranking, statistic=ranking.statistic | told, fitted=frozenset(told))
@@ -172,7 +172,7 @@ class Steps:
         each = [*found, *other]
         given_up = [Found("", None, rows_of(each), each[0].ranking)] if each else []
         one, two = (s.fit([*steps, *given_up]) for s, steps in ((self, found), (of or self, other)))
-        return one is not None and (two is None or bool(_quality(one) > _quality(two) + by))
+        return one is not None and (two is None or bool(quality(one) > quality(two) + by))
 
     def _has_shape(self, name: str) -> bool:
         """Whether a candidate's shape goes on between the forms searched; a fit of a platform takes too long for it."""
@@ -198,7 +198,7 @@ class Steps:
             return each[0]
         given_up = Found("", None, rows_of(each), ranking)
         fits = [self.fit(standing([*found, step, given_up])) for step in each]
-        return max(zip(fits, each, strict=True), key=lambda pair: _quality(pair[0]) if pair[0] else -np.inf)[1]
+        return max(zip(fits, each, strict=True), key=lambda pair: quality(pair[0]) if pair[0] else -np.inf)[1]
 
     def _seen(self, estimate: Estimate) -> Scanner:
         """The search without the samples at which the output ends: of anything more they tell nothing."""
@@ -255,7 +255,7 @@ def _profiled(estimate: Estimate) -> float:
     return estimate.log_likelihood - 0.5 * float(volume)
 
 
-def _quality(estimate: Estimate) -> float:
+def quality(estimate: Estimate) -> float:
     """ln likelihood of a fit, less what its parameters cost (Schwarz): by it fits of different parameters compare."""
     p, nu = len(estimate.covariance), estimate.degrees_of_freedom
     return _profiled(estimate) - 0.5 * p * float(np.log(nu + p))
