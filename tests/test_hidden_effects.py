@@ -57,7 +57,7 @@ HIDDEN_BY = {
     "temperature_lag": "test_memory_effects.py::test_a_late_thermometer_under_a_curved_bias_is_named_with_its_delay",
     "thermometer_error": "test_temperature_curves.py::test_the_same_ripple_in_bias_and_scale_factor_is_the_thermistor",
     "bias_temperature_gradient": "test_fiber_optic.py::test_a_hidden_gradient_is_named",
-    "bias_temperature_gradient_rate": "test_hidden_effects.py::test_a_changing_gradient_is_named",
+    "bias_temperature_gradient_rate": "test_thermometer_noise.py::test_large_errors_of_a_changing_coil_are_named",
     "scale_spline": "test_hidden_effects.py::test_a_wave_of_the_curve_over_rate_is_a_spline",
     "loop_dynamics": "test_platform_diagnosis.py::test_another_loop_is_named_where_the_friction_is_known",
 }

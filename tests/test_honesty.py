@@ -15,7 +15,7 @@ from gyromodel.averages import average
 from gyromodel.diagnosis._data import read
 from gyromodel.diagnosis._isolation import settling_test
 from gyromodel.diagnosis._points import dwells_apart
-from gyromodel.diagnosis._steps import _quality
+from gyromodel.diagnosis._steps import quality
 from gyromodel.effects.drivers import BiasColumn, BiasPeriodic, BiasStep
 from gyromodel.estimate import fit_record
 from gyromodel.model import ModelError
@@ -488,14 +488,14 @@ def test_fits_of_more_parameters_pay_for_each():
     temperature = 25 + 30 * np.sin(2 * np.pi * np.arange(ROWS) / 150)
     measured = campaign(5 + 0.1 * temperature + rng.standard_normal(ROWS), temperature=temperature)
     columns = [np.ones(ROWS), temperature, temperature**2, temperature**3]
-    quality, expected = [], []
+    found, expected = [], []
     for p, effects in ((1, ["bias"]), (2, ["bias", "bias_temperature"]), (3, ["bias", "bias_temperature_curve"])):
         record = read_signals([measured])
-        quality.append(_quality(fit_record(record, gm.model_from_effects(effects), ratios=NoiseRatios(0.0, 0.0))))
+        found.append(quality(fit_record(record, gm.model_from_effects(effects), ratios=NoiseRatios(0.0, 0.0))))
         design = np.stack(columns[:p], axis=1)
         rss = np.linalg.lstsq(design, np.asarray(measured.columns["output"]), rcond=None)[1][0]
         expected.append(-0.5 * ROWS * np.log(rss) - 0.5 * p * np.log(ROWS))
-    assert np.diff(quality) == pytest.approx(np.diff(expected), abs=1e-6)
+    assert np.diff(found) == pytest.approx(np.diff(expected), abs=1e-6)
 
 
 @pytest.mark.long

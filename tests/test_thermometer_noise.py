@@ -45,7 +45,7 @@ def simulation() -> gm.GyroModel:
 @pytest.mark.parametrize(
     ("size", "effect"), [(4000.0, "gradient_rate"), (16000.0, "gradient_rate"), (16000.0, "shupe")]
 )
-def test_errors_of_a_changing_coil_are_named_however_large(size: float, effect: str, rng: np.random.Generator):
+def test_large_errors_of_a_changing_coil_are_named(size: float, effect: str, rng: np.random.Generator):
     """Nineteen of twenty or more: named, or in the set with what contains it; and no cause beside it.
 
     At 16000 deg/h per degC/s the error is 100 deg/h in noise of 0.4, and what two thermometers leave of it 0.5.
