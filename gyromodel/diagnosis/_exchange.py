@@ -12,7 +12,7 @@ from gyromodel.diagnosis._forms import periodic
 from gyromodel.diagnosis._lines import lines_of, near
 from gyromodel.diagnosis._misfit import lines_of_noise, unsteady_lines
 from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, is_driver, is_noise
-from gyromodel.diagnosis._steps import EXCHANGE, Found, Steps, standing
+from gyromodel.diagnosis._steps import BETWEEN, EXCHANGE, Found, Steps, standing
 from gyromodel.effects.drivers import BiasPeriodic
 from gyromodel.estimate import Estimate
 
@@ -32,7 +32,7 @@ def exchanged(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[lis
     """
     while True:
         found, estimate, rankings = _chosen_again(steps, found, estimate)
-        if fewer := _one_for_two(steps, found, rankings):
+        if fewer := _one_for_two(steps, found, estimate, rankings):
             found, estimate = fewer
             continue
         own = {i: r.statistic[found[i].name] for i, r in rankings.items() if found[i].name in r.statistic}
@@ -47,27 +47,33 @@ def exchanged(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[lis
         found, estimate = fewer, after
 
 
-def _one_for_two(steps: Steps, found: list[Found], rankings: dict[int, Ranking]) -> tuple[list[Found], Estimate] | None:
+def _one_for_two(
+    steps: Steps, found: list[Found], estimate: Estimate, rankings: dict[int, Ranking]
+) -> tuple[list[Found], Estimate] | None:
     """What was found less an addition that another one, which it led by little, makes needless in a wider form.
 
     `rankings` are those beside all but one. Two names have to do better than the one by the odds of a firm name.
     """
     for i, j in permutations(range(len(found)), 2):
         step, other = found[i], found[j]
-        led_by = step.ranking.statistic.get(step.name, np.inf) - step.ranking.statistic.get(other.name, -np.inf)
-        if step.effect is None or other.effect is None or step.name == other.name or led_by > DOUBT:
+        own = step.ranking.statistic.get(step.name, np.inf)
+        led_by = own - step.ranking.statistic.get(other.name, -np.inf)
+        # As much as a shape between those searched may lose is no lead.
+        led = led_by > max(DOUBT, BETWEEN * own)
+        if led or step.effect is None or other.effect is None or step.name == other.name or j not in rankings:
             continue
         others = [f for k, f in enumerate(found) if k not in (i, j)]
         base = steps.fit(others)
-        if base is None or j not in rankings:
+        if base is None:
             continue
         ranking = steps.rank(base, others)
-        first, alone = (ranking.statistic.get(f.name, -np.inf) for f in (step, other))
-        both = first + rankings[j].statistic.get(other.name, -np.inf)
-        if alone < max(both - DOUBT, steps.least(ranking, other.name)):
+        if ranking.statistic.get(other.name, -np.inf) < steps.least(ranking, other.name):
             continue
         one, after = steps.add(others, steps.step(others, base, ranking, other.name))
-        if after is not None and not unresolved(after, one, steps.scanner.step):
+        if after is None or unresolved(after, one, steps.scanner.step):
+            continue
+        # In one noise, as another would take up a part.
+        if replace(steps, noise=(estimate.ratios,)).fits_better([*others, one], found, -DOUBT):
             return [*others, one], after
     return None
 

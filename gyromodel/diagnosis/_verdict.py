@@ -23,7 +23,7 @@ from gyromodel.diagnosis._said import places, told, told_of_cause, told_of_drive
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import UNKNOWN_EVIDENCE, Selection
 from gyromodel.diagnosis._shapes import remaining
-from gyromodel.diagnosis._steps import Found, Steps
+from gyromodel.diagnosis._steps import BETWEEN, Found, Steps
 from gyromodel.effects._shapes import beyond_earth
 from gyromodel.effects.drivers import BiasPeriodic
 from gyromodel.estimate import Estimate
@@ -249,7 +249,11 @@ def _left_by(cause: Cause, causes: Sequence[Cause], estimate: Estimate, vague: b
 
     Thermal ones leave thermal ones, a converter's codes leave lines. Beside a vague one it need not be far stronger.
     """
-    if (cause.statistic > FAINT and not vague) or is_noise(cause.effect):
+    if is_noise(cause.effect):
+        return {}
+    if form := _left_by_form(cause, causes, estimate):
+        return {form: 0.5}
+    if cause.statistic > FAINT and not vague:
         return {}
     needs = {e.label: set(thermometers(e.columns_needed)) for e in estimate.model.effects}
     own = needs.get(cause.effect, set())
@@ -260,6 +264,16 @@ def _left_by(cause: Cause, causes: Sequence[Cause], estimate: Estimate, vague: b
     least = (1.0 if vague else OUTDONE) * cause.statistic
     others = [c for c in causes if c.statistic > least and own & needs.get(c.effect, set())]
     return {max(others, key=lambda c: c.statistic).effect: 0.5} if others else {}
+
+
+def _left_by_form(cause: Cause, causes: Sequence[Cause], estimate: Estimate) -> str:
+    """The cause of a shape, if any, that may leave another as much for a form that is not quite its own."""
+    shaped = {e.label: {*e.columns_needed} for e in estimate.model.effects
+              if not all(p.linear for p in e.declared().values())}  # fmt: skip
+    own = next((set(e.columns_needed) for e in estimate.model.effects if e.label == cause.effect), set())
+    larger = [c for c in causes if c.effect in shaped and cause.statistic < BETWEEN * c.statistic]
+    larger = [c for c in larger if cause.effect == "outliers" or own & shaped[c.effect]]
+    return max(larger, key=lambda c: c.statistic).effect if larger else ""
 
 
 def _fitted(cause: Cause) -> list[ParameterValue]:
