@@ -178,7 +178,8 @@ def _diagnosed(
         else:
             ratio = ParameterValue("ratio", grows.ratio, grows.ratio_std, "1")
             beyond.append(as_cause("noise_heteroscedastic", grows.evidence, ratio))
-    selection = within_thermometers(session, selection, record)
+    selection, not_named = within_thermometers(session.steps, selection, record)
+    findings += [not_named] if not_named else []
     if record.domain == "platform" and selection.found and (failed := unexplained_axes(selection.estimate)):
         moves = f"the base moves about {listed(failed)} as nothing in the catalogue makes it"
         others = without_axis(measured, failed[0], model, session.threshold, say)
@@ -407,7 +408,7 @@ def _gain(
 
     def select(rows: np.ndarray, base: Estimate) -> Estimate:
         fold = Session(session.scanner.without(rows, cells), base, session.threshold)
-        return within_thermometers(fold, fold.run(noise=noise), measured).estimate
+        return within_thermometers(replace(fold.steps, noise=noise), fold.run(noise=noise), measured)[0].estimate
 
     return nested_gain(
         session.record,
