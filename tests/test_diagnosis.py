@@ -11,6 +11,7 @@ from collections import Counter
 from copy import copy
 from importlib import resources
 from itertools import combinations, product
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,10 +30,11 @@ from gyromodel.diagnosis._epochs import epoch_interval
 from gyromodel.diagnosis._evidence import (
     SAFE_THRESHOLD,
     SIZES,
-    evidence_of_draws,
+    TOGETHER,
     explained_for,
     log_evidence_ratio,
     log_mean,
+    mean_evidence_of_draws,
     safe_threshold,
 )
 from gyromodel.diagnosis._forms import step_at
@@ -315,11 +317,15 @@ def test_a_threshold_of_draws_is_beyond_the_99_percent_point(
     assert far <= stats.binom.ppf(1 - 1e-6, 400, 0.01)
 
 
-def test_evidence_of_many_sets_is_that_of_each(rng: np.random.Generator) -> None:
-    t = rng.chisquare(2, (300, 40))
-    t[7, :3] += [20.0, 60.0, 120.0]
-    each, many = log_mean(log_evidence_ratio(t, 900.0, 900, 2)), evidence_of_draws(t, np.full(40, 900.0), 900, 2)
-    assert np.allclose(np.log(np.mean(many, axis=0)), each, rtol=0, atol=3e-3)
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_evidence_of_many_sets_is_that_of_each(order: Literal["C", "F"], rng: np.random.Generator) -> None:
+    """However many are weighed at once, and however they lie."""
+    sets = 2 * TOGETHER // 300 + 7
+    t = np.asarray(rng.chisquare(2, (300, sets)), order=order)
+    t[7, -3:] += [20.0, 60.0, 120.0]
+    rss = rng.uniform(800.0, 1000.0, sets)
+    each, many = log_mean(log_evidence_ratio(t, rss, 900, 2)), mean_evidence_of_draws(t, rss, 900, 2)
+    assert np.allclose(np.log(many), each, rtol=0, atol=3e-3)
 
 
 def test_a_fold_does_not_search_what_only_the_rows_left_out_would_tell(rng: np.random.Generator) -> None:
