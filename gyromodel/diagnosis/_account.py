@@ -9,7 +9,7 @@ import numpy as np
 
 from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise
 from gyromodel.diagnosis._result import Candidate, Round
-from gyromodel.diagnosis._search import Selection
+from gyromodel.diagnosis._selection import Selection
 from gyromodel.diagnosis._session import Session
 from gyromodel.diagnosis._steps import Found
 

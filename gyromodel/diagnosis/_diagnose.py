@@ -24,7 +24,8 @@ from gyromodel.diagnosis._noise_causes import as_cause, quantisation, telegraph
 from gyromodel.diagnosis._points import dwells_apart
 from gyromodel.diagnosis._ranking import SLOW_IN_TIME, cells_of_weight, noise_kinds
 from gyromodel.diagnosis._result import Cause, Diagnosis, Gain, ParameterValue
-from gyromodel.diagnosis._search import Progress, Selection
+from gyromodel.diagnosis._search import Progress
+from gyromodel.diagnosis._selection import Selection
 from gyromodel.diagnosis._session import (
     Session,
     laid_out,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gyromodel.diagnosis._search import Selection
+from gyromodel.diagnosis._selection import Selection
 from gyromodel.diagnosis._shapes import driver_shape
 from gyromodel.diagnosis._steps import Steps
 from gyromodel.effects.drivers import BiasPeriodic

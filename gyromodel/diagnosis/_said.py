@@ -14,7 +14,7 @@ from gyromodel.diagnosis._lines import lines_of
 from gyromodel.diagnosis._ranking import is_driver, special_cases
 from gyromodel.diagnosis._result import CREDIBLE, VAGUE
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._search import Selection
+from gyromodel.diagnosis._selection import Selection
 from gyromodel.diagnosis._smooths import recoveries
 from gyromodel.diagnosis._steps import Found, Steps
 from gyromodel.effects import Effect

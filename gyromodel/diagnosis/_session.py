@@ -16,7 +16,8 @@ from gyromodel.diagnosis._evidence import safe_threshold
 from gyromodel.diagnosis._gain import ladder_error
 from gyromodel.diagnosis._misfit import unexplained_axes
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._search import Progress, Selection, search, significant_driver, steadied
+from gyromodel.diagnosis._search import Progress, search, steadied
+from gyromodel.diagnosis._selection import Selection, significant_driver
 from gyromodel.diagnosis._steps import EXCHANGE, NoisePath, Steps, standing
 from gyromodel.diagnosis._variance import Growth, with_variance
 from gyromodel.estimate import Estimate, EstimateError, Unrounded, fit_record

@@ -16,7 +16,7 @@ from gyromodel.diagnosis._forms import form_effect
 from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise, skipped
 from gyromodel.diagnosis._result import Driver
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._search import Selection
+from gyromodel.diagnosis._selection import Selection
 from gyromodel.effects import Effect
 from gyromodel.estimate import Estimate
 from gyromodel.model import GyroModel

@@ -11,7 +11,7 @@ from gyromodel._checks import listed, thermometers
 from gyromodel.declarations import measured as base_of
 from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._ranking import Ranking, is_noise
-from gyromodel.diagnosis._search import FURTHER, Selection, significant_driver
+from gyromodel.diagnosis._selection import FURTHER, Selection, significant_driver
 from gyromodel.diagnosis._steps import Found, Steps, quality, rows_of
 from gyromodel.estimate import Estimate, filter_of, whiten_columns
 from gyromodel.model import effect_class

@@ -11,6 +11,7 @@ from gyromodel._checks import thermometers
 from gyromodel.campaign import Campaign
 from gyromodel.declarations import BEHIND, EARLIER, RATE_OF, measured
 from gyromodel.diagnosis._apart import like, twins
+from gyromodel.diagnosis._beside import UNKNOWN_EVIDENCE
 from gyromodel.diagnosis._causes import cause_of
 from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._exchange import uncontested
@@ -21,7 +22,7 @@ from gyromodel.diagnosis._result import CREDIBLE, VAGUE, Cause, ParameterValue, 
 from gyromodel.diagnosis._rounded import curve_of_rounding, no_farther, no_larger, of_rounding
 from gyromodel.diagnosis._said import places, told, told_of_cause, told_of_driver, told_of_rest
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._search import UNKNOWN_EVIDENCE, Selection
+from gyromodel.diagnosis._selection import Selection
 from gyromodel.diagnosis._shapes import remaining
 from gyromodel.diagnosis._steps import BETWEEN, Found, Steps
 from gyromodel.effects._shapes import beyond_earth

@@ -38,7 +38,9 @@ def _patches(name: str) -> dict[str, Any]:
         rows = np.stack([a + values[a:b].argmax(0) for a, b in zip(starts, ends, strict=True)])
         return np.maximum.reduceat(values, starts, axis=0), rows
 
-    def refitted(session: Any, baseline: Any, selection: Any, unit: str, scale: float, ordinary: Any, say: Any) -> Any:
+    def refitted(
+        session: Any, baseline: Any, selection: Any, measured: Any, unit: str, scale: float, ordinary: Any, say: Any
+    ) -> Any:
         chosen = selection.estimate
 
         def select(rows: np.ndarray, base: Any) -> Any:
@@ -46,7 +48,7 @@ def _patches(name: str) -> dict[str, Any]:
 
         return _diagnose.nested_gain(session.record, baseline, select, unit, scale, ordinary)
 
-    forced = {"_session.safe_threshold": lambda nu: -1e9, "_search.MAXIMUM_ROUNDS": 1}
+    forced = {"_session.safe_threshold": lambda nu: -1e9, "_search.MAXIMUM_ROUNDS": 1, "_beside.MAXIMUM_ROUNDS": 1}
     return {
         "no_whitening": {"_session.noise_grid": white_only},
         "no_projection": {"_scan.Scanner.run_many": nothing_projected},
