@@ -98,6 +98,24 @@ def test_what_is_hidden_is_named_and_nothing_else(design: str, effect: str):
 
 
 @pytest.mark.long
+@pytest.mark.parametrize(
+    ("seed", "design", "noise", "effect", "times"),
+    [
+        (3006073748926428, "rate_steps", "white", "rate_hysteresis", 100.0),
+        (2393908075183046, "rate_temperature", "random_walk", "scale_nonlinearity", 30.0),
+    ],
+)
+def test_what_a_form_leaves_of_a_large_error_is_no_firm_name(
+    seed: int, design: str, noise: str, effect: str, times: float
+):
+    """Of 460 and 150 standard deviations: anomalous dwells beside a relay, a sine of the rate beside a cubic."""
+    record = study.run_case(study.Case(seed, design, noise, effect, times))
+    assert record.answer is not None and record.score is not None
+    assert record.answer.verdict in ("named", "ambiguous") and effect in record.answer.credible
+    assert not record.score.firm_and_wrong
+
+
+@pytest.mark.long
 def test_a_wave_of_the_curve_over_rate_is_a_spline():
     """1.8 periods on a curve over 61 rates, each visited three times: no polynomial of the fifth order has them."""
     rng = np.random.default_rng(EXAMPLE)

@@ -268,12 +268,15 @@ def _left_by(cause: Cause, causes: Sequence[Cause], estimate: Estimate, vague: b
 
 
 def _left_by_form(cause: Cause, causes: Sequence[Cause], estimate: Estimate) -> str:
-    """The cause of a shape, if any, that may leave another as much for a form that is not quite its own."""
-    shaped = {e.label: {*e.columns_needed} for e in estimate.model.effects
-              if not all(p.linear for p in e.declared().values())}  # fmt: skip
-    own = next((set(e.columns_needed) for e in estimate.model.effects if e.label == cause.effect), set())
+    """The cause of a gyro, if any, that may leave another as much: it has a shape, which may not be quite its own."""
+    if estimate.record.domain != "gyro":
+        return ""
+    effects = {e.label: e for e in estimate.model.effects}
+    follows = {label: {*e.columns_needed} - {"time"} for label, e in effects.items()}
+    shaped = {label for label, e in effects.items() if not all(p.linear for p in e.declared().values())}
     larger = [c for c in causes if c.effect in shaped and cause.statistic < BETWEEN * c.statistic]
-    larger = [c for c in larger if cause.effect == "outliers" or own & shaped[c.effect]]
+    own = follows.get(cause.effect, set())
+    larger = [c for c in larger if follows[c.effect] and (cause.effect == "outliers" or own & follows[c.effect])]
     return max(larger, key=lambda c: c.statistic).effect if larger else ""
 
 
