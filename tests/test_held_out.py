@@ -10,7 +10,7 @@ import pytest
 
 import gyromodel as gm
 from gyromodel.diagnosis import _session
-from gyromodel.diagnosis._gain import _summary, folds_of, held_out, with_predictable_blocks
+from gyromodel.diagnosis._gain import _summary, folds_of, held_out
 from gyromodel.estimate import fit_record
 from gyromodel.noise import NoiseRatios
 from gyromodel.signals import read_signals
@@ -164,16 +164,3 @@ def test_the_true_gain_of_the_study_is_that_of_least_squares_on_average(effect: 
 def test_rounds_are_cut_where_the_error_left_out_rises_for_good(after: list[tuple[float, float]], cut: bool) -> None:
     """Held-out errors and log scores of rounds after one with 1 and 100."""
     assert _session.rises_for_good((1.0, 100.0), *after) == cut
-
-
-def test_blocks_are_parted_only_where_a_run_has_a_bias_of_its_own_and_no_row_elsewhere(rng: np.random.Generator):
-    """Segments that each run goes through can be left out whole, as the run's other segments tell its bias."""
-    own = gm.model_from_effects(["bias", "bias_turn_on"])
-    run = np.repeat(np.arange(1.0, RUNS + 1), ROWS)
-    by_run = read_signals(log(rng).with_column("run", run, ""))
-    parted = with_predictable_blocks(by_run, own)
-    assert len(np.unique(parted.blocks)) == 5 * RUNS
-    assert parted.block_scheme == f"fifths of {by_run.block_scheme}"
-    assert with_predictable_blocks(by_run, gm.model_from_effects(["bias"])) is by_run
-    across = by_run._replace(blocks=np.tile(np.repeat(np.arange(4), ROWS // 4), RUNS))
-    assert with_predictable_blocks(across, own) is across

@@ -79,6 +79,20 @@ def test_what_follows_no_thermometer_is_told_of_beside_it(beside: str, rng: np.r
     assert any("gross error" in line for line in found.findings) or not gross
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("size", [0.1, 0.3])
+def test_a_bias_over_temperature_is_named_beside_a_simulated_rate_effect(size: float, rng: np.random.Generator):
+    """Of 3 and 8 deg/h from cold to warm: what thermometers leave of 100 deg/h is no function of the temperature."""
+    log = fiber_optic.log(fiber_optic.Gyro(gradient_rate=16000.0), HOURS, rng)
+    bent = np.interp(log["temperature"], *(np.linspace(0, 60, 601), fiber_optic.bent_bias(np.linspace(0, 60, 601))))
+    columns = means(log | {"output": log["output"] - bent})
+    columns["output"] = columns["output"] + size * (columns["temperature"] - 20.0)
+    model = gm.model_from_effects(["bias", "bias_temperature_gradient_rate"])
+    found = gm.diagnose(campaign(columns), model, hold_out=False)
+    assert found.verdict in ("named", "ambiguous")
+    assert {"bias_temperature", "bias_temperature_curve"} & {*found.credible_set, *(c.effect for c in found.causes)}
+
+
 def test_what_is_left_is_what_a_perfect_thermometer_would_explain(rng: np.random.Generator):
     """Against the temperatures that the thermometers read, which no campaign knows."""
     effect = 16000.0

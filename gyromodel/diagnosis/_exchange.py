@@ -56,10 +56,10 @@ def _one_for_two(
     """
     for i, j in permutations(range(len(found)), 2):
         step, other = found[i], found[j]
-        own = step.ranking.statistic.get(step.name, np.inf)
+        own = step.ranking.statistic.get(step.name, -np.inf)
         led_by = own - step.ranking.statistic.get(other.name, -np.inf)
         # As much as a shape between those searched may lose is no lead.
-        led = led_by > max(DOUBT, BETWEEN * own)
+        led = not np.isfinite(own) or led_by > max(DOUBT, BETWEEN * own)
         if led or step.effect is None or other.effect is None or step.name == other.name or j not in rankings:
             continue
         others = [f for k, f in enumerate(found) if k not in (i, j)]

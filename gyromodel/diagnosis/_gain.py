@@ -8,7 +8,6 @@ import numpy as np
 from scipy import stats
 
 from gyromodel.diagnosis._result import Gain
-from gyromodel.effects.power_cycles import cycles
 from gyromodel.estimate import Estimate, EstimateError, filter_of, fit_record, pad_columns, whiten_columns
 from gyromodel.model import GyroModel
 from gyromodel.signals import Record
@@ -24,13 +23,10 @@ PARTS = 5
 
 
 def with_predictable_blocks(record: Record, model: GyroModel) -> Record:
-    """The record with blocks that can be left out: parts of them where runs have own biases and a block holds one."""
+    """The record with blocks that can be left out: where every run has a bias of its own, parts of runs."""
     if "bias_turn_on" not in model.labels:
         return record
     number = np.unique(record.blocks, return_inverse=True)[1]
-    cycle = np.asarray(cycles(record.signals))[: record.rows]
-    if all(len(np.unique(number[cycle == c])) > 1 for c in np.unique(cycle)):
-        return record
     blocks = PARTS * number
     for k in range(number.max() + 1):
         rows = np.flatnonzero(number == k)

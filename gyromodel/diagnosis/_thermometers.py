@@ -10,13 +10,21 @@ import numpy as np
 from gyromodel._checks import listed, thermometers
 from gyromodel.declarations import measured as base_of
 from gyromodel.diagnosis._drivers import smooth_columns
-from gyromodel.diagnosis._ranking import Ranking, is_noise
-from gyromodel.diagnosis._selection import FURTHER, Selection, significant_driver
+from gyromodel.diagnosis._ranking import is_driver, is_noise
+from gyromodel.diagnosis._selection import FURTHER, Selection
 from gyromodel.diagnosis._steps import Found, Steps, quality, rows_of
 from gyromodel.estimate import Estimate, filter_of, whiten_columns
-from gyromodel.model import effect_class
 from gyromodel.signals import Record, thermometer_rate, with_smooth_thermometers
 
+# What follows a temperature's rate of change, or how far one temperature is behind another.
+LATE = (
+    "bias_temperature_rate",
+    "bias_temperature_product",
+    "bias_temperature_gradient",
+    "bias_temperature_gradient_rate",
+    "bias_thermal_hysteresis",
+    "temperature_lag",
+)
 # Evidence (nats) that such noise must be able to make from which on it is asked for.
 SHOWS = 3.0
 
@@ -25,8 +33,8 @@ def within_thermometers(steps: Steps, selection: Selection, as_read: Record) -> 
     """What was found, less further thermal names that explain no more than noise of thermometers leaves of the largest.
 
     A rate of change is known no better than its thermometer is read: beside a large error that follows it, what that
-    leaves is more than the gyro's noise, follows other thermal names by a part, and is in no fit. What follows no
-    thermometer stays, and so does all where it explains more.
+    leaves is more than the gyro's noise, follows other thermal names by a part, and is in no fit. What follows a
+    temperature itself, or no thermometer, stays where it shows beside what is left, and all stays that explains more.
 
     Args:
         steps: of the search.
@@ -36,11 +44,11 @@ def within_thermometers(steps: Steps, selection: Selection, as_read: Record) -> 
     Returns:
         The selection, and what is to be said of names that it no longer has.
     """
-    found, first, driver = selection.found, selection.first, selection.driver
-    thermal_driver = driver is not None and _thermal(*(base_of(c)[0] for c in smooth_columns(driver)))
-    if steps.scanner.record.domain != "gyro" or not (thermal_driver or any(_thermal(*f.follows) for f in found)):
+    found, first = selection.found, selection.first
+    thermal = selection.driver is not None and _thermal(selection.driver)
+    if steps.scanner.record.domain != "gyro" or not (thermal or any(f.name in LATE for f in found)):
         return selection, ""
-    others = [f for f in found if not _thermal(*f.follows)]
+    others = [f for f in found if f.name not in LATE]
     bases = [(steps.baseline, others)]
     name, _ = first.best(drivers=False, but=("outliers", *filter(is_noise, first.statistic)))
     if found and name is not None:
@@ -52,73 +60,69 @@ def within_thermometers(steps: Steps, selection: Selection, as_read: Record) -> 
         if alone is not None:
             bases.append((alone, [strongest, *(f for f in others if f.name != name)]))
     for base, kept in bases:
-        if not (len(kept) < len(found) or thermal_driver):
-            continue
-        left = left_by_thermometers(base, as_read, selection.estimate)
-        if left < SHOWS:
-            continue
-        given_up = Found("", None, rows_of([*found, *kept]), first)
-        fewer, whole = steps.fit([*kept, given_up]), steps.fit([*found, given_up])
-        if fewer is None or whole is None:
-            continue
-        if quality(whole) - quality(fewer) + selection.followed * thermal_driver <= left:
-            return _only(steps, selection, kept, left, thermal_driver)
+        if len(kept) < len(found) or thermal:
+            left = left_by_thermometers(base, as_read, selection.estimate)
+            fewer = _only(steps, selection, kept, left) if left >= SHOWS else None
+            if fewer is not None:
+                return fewer
     return selection, ""
 
 
-def _thermal(*columns: str) -> bool:
-    return bool(thermometers(columns))
+def _thermal(driver: str) -> bool:
+    return bool(thermometers(base_of(column)[0] for column in smooth_columns(driver)))
 
 
-def _only(
-    steps: Steps, selection: Selection, kept: list[Found], left: float, thermal_driver: bool
-) -> tuple[Selection, str]:
-    """A selection of a part of what was found, each ranked beside those before it; the rest is what is left (nats)."""
+def _only(steps: Steps, selection: Selection, kept: list[Found], left: float) -> tuple[Selection, str] | None:
+    """A selection of a part of what was found, each ranked beside those before it, and what is said of the rest.
+
+    None where the rest explains more than is left (nats), or there is no fit.
+    """
     path, estimates = list[Found](), [steps.baseline]
     for step in kept:
         ranking = steps.rank(estimates[-1], path)
-        if not step.points and ranking.statistic.get(step.name, -np.inf) < _least(steps, ranking, step, bool(path)):
+        least = steps.least(ranking, step.name) + step.more + FURTHER * bool(path)
+        if not step.points and ranking.statistic.get(step.name, -np.inf) < least:
             continue
         path.append(replace(step, ranking=ranking, paired=False))
         after = steps.fit(path)
         if after is None:
-            return selection, ""
+            return None
         estimates.append(after)
+    # In one noise, as another would take up what is missing.
+    held = replace(steps, noise=(selection.estimate.ratios,))
+    given_up = Found("", None, rows_of([*selection.found, *path]), selection.first)
+    fewer, whole = held.fit([*path, given_up]), held.fit([*selection.found, given_up])
+    thermal = selection.driver if selection.driver and _thermal(selection.driver) else ""
+    followed = selection.followed if thermal else 0.0
+    if fewer is None or whole is None or quality(whole) - quality(fewer) + followed > left:
+        return None
     last = steps.rank(estimates[-1], path)
-    driver, more = significant_driver(last, steps.threshold), selection.remains
-    if driver and _thermal(*(base_of(c)[0] for c in smooth_columns(driver))):
-        if last.statistic[driver] > left:
-            return selection, ""
-        driver = None
-    shows = more in last.statistic and last.statistic[more] >= steps.least(last, more)
-    more = more if shows and not _thermal(*_needs(more)) else ""
+    drivers = {k: v for k, v in last.statistic.items() if is_driver(k)}
+    shows = {k: v for k, v in drivers.items() if v >= steps.least(last, k)}
+    if any(_thermal(k) and v > left for k, v in shows.items()):
+        return None
+    more = selection.remains
+    if last.statistic.get(more, -np.inf) < (left if more in LATE else steps.least(last, more) if more else np.inf):
+        more = ""
     rest = sorted({f.name for f in selection.found} - {f.name for f in path})
-    if thermal_driver:
-        rest.append(f"what follows {' and '.join(smooth_columns(str(selection.driver)))}")
+    rest += [f"what follows {' and '.join(smooth_columns(thermal))}"] if thermal else []
+    if not rest:
+        return None
     beside = f" beside {listed([f.name for f in path])}" if path else ""
     said = (
         f"Not named{beside}: {listed(rest)}. Together they explain no more than about what noise of the thermometers "
         "leaves: less of it, or the temperature changed more slowly, would tell."
     )
-    fewer = Selection(
+    return Selection(
         estimates[-1],
         tuple(path),
         tuple(path),
         last,
         tuple(estimates),
-        driver,
+        max((k for k in shows if not _thermal(k)), key=lambda k: shows[k], default=None),
         remains=more,
         unresolved=selection.unresolved,
-    )
-    return fewer, said
-
-
-def _needs(name: str) -> tuple[str, ...]:
-    return () if name == "outliers" or is_noise(name) else effect_class(name).needs
-
-
-def _least(steps: Steps, ranking: Ranking, step: Found, further: bool) -> float:
-    return steps.least(ranking, step.name) + step.more + FURTHER * further
+    ), said
 
 
 def left_by_thermometers(estimate: Estimate, as_read: Record, noise: Estimate) -> float:

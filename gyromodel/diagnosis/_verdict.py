@@ -276,7 +276,9 @@ def _left_by_form(cause: Cause, causes: Sequence[Cause], estimate: Estimate) -> 
     shaped = {label for label, e in effects.items() if not all(p.linear for p in e.declared().values())}
     larger = [c for c in causes if c.effect in shaped and cause.statistic < BETWEEN * c.statistic]
     own = follows.get(cause.effect, set())
-    larger = [c for c in larger if follows[c.effect] and (cause.effect == "outliers" or own & follows[c.effect])]
+    larger = [
+        c for c in larger if follows[c.effect] and (cause.effect == "outliers" or (own and own <= follows[c.effect]))
+    ]
     return max(larger, key=lambda c: c.statistic).effect if larger else ""
 
 
