@@ -15,19 +15,19 @@ from gyromodel.diagnosis._account import as_added, evidence_at_sizes, more_neede
 from gyromodel.diagnosis._calibrate import null_scores, threshold_of
 from gyromodel.diagnosis._data import Data, read
 from gyromodel.diagnosis._extended import finished, stated_counts, stated_hops, stated_level
-from gyromodel.diagnosis._gain import nested_gain, no_gain, not_measured, with_predictable_blocks
+from gyromodel.diagnosis._folds import gain_of
+from gyromodel.diagnosis._gain import not_measured, with_predictable_blocks
 from gyromodel.diagnosis._intervals import CLEARER, COUNTED, HALF, over_intervals
 from gyromodel.diagnosis._isolation import settling_test
 from gyromodel.diagnosis._judgement import structured, undecided, with_noise, with_steps
 from gyromodel.diagnosis._misfit import excess_band, unexplained_axes
 from gyromodel.diagnosis._noise_causes import as_cause, quantisation, telegraph
 from gyromodel.diagnosis._points import dwells_apart
-from gyromodel.diagnosis._ranking import SLOW_IN_TIME, cells_of_weight, noise_kinds
-from gyromodel.diagnosis._result import Cause, Diagnosis, Gain, ParameterValue
+from gyromodel.diagnosis._ranking import SLOW_IN_TIME, noise_kinds
+from gyromodel.diagnosis._result import Cause, Diagnosis, ParameterValue
 from gyromodel.diagnosis._search import Progress
 from gyromodel.diagnosis._selection import Selection
 from gyromodel.diagnosis._session import (
-    Session,
     laid_out,
     over_angle_noise,
     over_power_cycles,
@@ -50,14 +50,12 @@ from gyromodel.estimate import (
     with_reading,
 )
 from gyromodel.model import GyroModel
-from gyromodel.signals import Record, with_columns_known
+from gyromodel.signals import with_columns_known
 from gyromodel.units import factor, from_internal
 
 FEWEST_DRAWS = 200
 # Searches beside rounding as it is at what the last has found.
 ROUNDINGS = 3
-# Folds search the noise cells within this many nats of the best of the main pass.
-FOLD_NEARBY = 3.0
 TURNED_ON = (
     "There seems to be a warm-up behind every gap, as if the gyro had been off: its time is counted from there. The "
     "model is applied to files whose column run tells power cycles apart."
@@ -290,7 +288,7 @@ def _diagnosed(
     gain = (
         not_measured(unit)
         if not hold_out
-        else _gain(session, baseline, selection, as_it_was, unit, scale, weights, say)
+        else gain_of(session, baseline, selection, as_it_was, unit, scale, weights, say)
     )
     driver = driver_shape(session.scanner, selection, judgement.driver, unit) if judgement.driver else None
     say("done", 1.0)
@@ -387,36 +385,3 @@ def _like_hops(selection: Selection, free: Estimate) -> bool:
     in_time = all(f.frees_noise or f.name in (*SLOW_IN_TIME, "bias_periodic") for f in selection.found)
     slow = any(float(r) > 0 for r in free.ratios[:3])
     return in_time and selection.driver in (None, "smooth(time)") and (slow or bool(selection.found))
-
-
-def _gain(
-    session: Session,
-    baseline: Estimate,
-    selection: Selection,
-    measured: Record,
-    unit: str,
-    scale: float,
-    ordinary: tuple[bool, bool],
-    say: Callable[[str, float], None],
-) -> Gain:
-    """The gain on blocks left out; `measured` is the record with temperatures as they were read."""
-    if not any(f.effect is not None or f.frees_noise for f in selection.found):
-        return no_gain(session.record, session.ladder(baseline)[0] * scale, unit)
-
-    rankings = [f.ranking for f in selection.path] + [selection.last]
-    noise = [e.ratios for e in selection.estimates]
-    cells = sorted({g for ranking in rankings for g in cells_of_weight(ranking, FOLD_NEARBY)})
-
-    def select(rows: np.ndarray, base: Estimate) -> Estimate:
-        fold = Session(session.scanner.without(rows, cells), base, session.threshold)
-        return within_thermometers(replace(fold.steps, noise=noise), fold.run(noise=noise), measured)[0].estimate
-
-    return nested_gain(
-        session.record,
-        baseline,
-        select,
-        unit,
-        scale,
-        ordinary,
-        lambda k, n: say(f"held-out block {k} of {n}", 0.7 + 0.28 * k / n),
-    )

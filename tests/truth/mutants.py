@@ -22,7 +22,7 @@ def mutated(name: str) -> Iterator[None]:
 def _patches(name: str) -> dict[str, Any]:
     if not name:
         return {}
-    from gyromodel.diagnosis import _diagnose, _scan, _session
+    from gyromodel.diagnosis import _scan, _session
     from gyromodel.estimate import fit_record
 
     run_many, grid = _scan.Scanner.run_many, _session.noise_grid
@@ -46,7 +46,7 @@ def _patches(name: str) -> dict[str, Any]:
         def select(rows: np.ndarray, base: Any) -> Any:
             return fit_record(session.record.without(rows), chosen.model_as_given(), ratios=chosen.ratios)
 
-        return _diagnose.nested_gain(session.record, baseline, select, unit, scale, ordinary)
+        return _gain.nested_gain(session.record, baseline, select, unit, scale, ordinary)
 
     forced = {"_session.safe_threshold": lambda nu: -1e9, "_search.MAXIMUM_ROUNDS": 1, "_beside.MAXIMUM_ROUNDS": 1}
     return {
@@ -57,5 +57,5 @@ def _patches(name: str) -> dict[str, Any]:
             "_one_cell.log_mean": lambda ratios: ratios.max(axis=0),
         },
         "forced": forced,
-        "forced_no_nesting": forced | {"_diagnose._gain": refitted},
+        "forced_no_nesting": forced | {"_diagnose.gain_of": refitted},
     }[name]
