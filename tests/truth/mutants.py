@@ -22,7 +22,7 @@ def mutated(name: str) -> Iterator[None]:
 def _patches(name: str) -> dict[str, Any]:
     if not name:
         return {}
-    from gyromodel.diagnosis import _scan, _session
+    from gyromodel.diagnosis import _gain, _scan, _session
     from gyromodel.estimate import fit_record
 
     run_many, grid = _scan.Scanner.run_many, _session.noise_grid
