@@ -112,3 +112,18 @@ def test_a_line_is_held_against_the_band_about_it(size: float, of_noise: bool, r
         line = BiasPeriodic(cosine=np.zeros(1), sine=np.zeros(1), frequency=np.array([greatest / ROWS]))
         told += lines_of_noise(fit_record(read_signals(log(output)), GyroModel((Bias(), line), {}), ratios=white))
     assert told.count(of_noise) >= (4 if of_noise else 5)
+
+
+def test_a_line_at_the_end_of_frequencies_is_held_against_the_noise_there(rng: np.random.Generator) -> None:
+    """Above the last ordinate, and three times as large as the mean of a band that rises to it lets it be."""
+    white, outside = NoiseRatios(jnp.zeros(()), jnp.zeros(())), 0
+    line = BiasPeriodic(cosine=np.zeros(1), sine=np.zeros(1), frequency=np.array([0.4993]))
+    wave = np.cos(2 * np.pi * 0.4993 * TIME)
+    for _ in range(5):
+        noise = lfilter([0.5], [1.0, 0.85], rng.standard_normal(ROWS))
+        noise -= wave * (wave @ noise) / (wave @ wave)
+        fitted = fit_record(read_signals(log(noise + 0.35 * wave)), GyroModel((Bias(), line), {}), ratios=white)
+        band = excess_band(fitted)
+        outside += band is not None and band.high < 0.4993
+        assert lines_of_noise(fitted) == [True]
+    assert outside

@@ -27,6 +27,8 @@ BENDS, UNSTEADY = 4, 0.2
 NEAR = 1.5
 # Ordinates of a band of frequencies, and its power over that of the others, from which on it is told of.
 NARROWEST, EXCESS = 8, 1.25
+# Ordinates nearest to a line that tell of the noise there.
+BESIDE = 32
 # Spreads beyond which a sample is a tail: two such side by side would make a band by themselves.
 TAIL = 4.0
 # Runs whose intervals differ by more than this ratio have no frequencies in common.
@@ -113,13 +115,23 @@ def unsteady_lines(estimate: Estimate) -> list[bool]:
 
 
 def lines_of_noise(estimate: Estimate) -> list[bool]:
-    """Whether each line of a model is no larger than what a band of unexplained noise about it makes."""
+    """Whether each line of a model is no larger than what a band of unexplained noise about it makes.
+
+    That is the band's mean power, or that next to the line, where noise that rises to an end of the band has more. A
+    line is about the band up to the narrowest that is told apart: the last ordinate is below the highest line.
+    """
     lines, band = lines_of(estimate.model), excess_band(estimate)
     if not lines or band is None:
         return [False] * len(lines)
-    chance = chi2.sf(line_energies(estimate) / band.ratio, 2) * estimate.record.rows / 2
-    within = [band.low <= line.frequency <= band.high for line in lines]
-    return [bool(there and c > SELDOM) for there, c in zip(within, chance, strict=True)]
+    power, spacing = _periodogram(estimate)
+    energies, margin, found = line_energies(estimate), NARROWEST * spacing, list[bool]()
+    for line, energy in zip(lines, energies, strict=True):
+        nearest = np.argsort(np.abs((1 + np.arange(len(power))) * spacing - line.frequency))[:BESIDE]
+        mean = float(np.mean(power[nearest]))
+        chance = max(chi2.sf(energy / band.ratio, 2), f.sf(energy / 2 / mean, 2, 2 * len(nearest)))
+        about = band.low - margin <= line.frequency <= band.high + margin
+        found.append(about and bool(chance * estimate.record.rows / 2 > SELDOM))
+    return found
 
 
 def line_energies(estimate: Estimate) -> np.ndarray:
@@ -145,15 +157,10 @@ def excess_band(estimate: Estimate) -> Band | None:
     steps = [np.median(step) for step in each if len(step) >= NARROWEST]
     if steps and max(steps) > UNLIKE * min(steps):
         return None
-    residual = estimate.whitened[record.present]
-    most = TAIL * float(np.median(np.abs(residual))) / norm.isf(0.25)
-    if not most > 0.0:
+    power, spacing = _periodogram(estimate)
+    if not power.any():
         return None
-    if estimate.ratios.quantisation is None:
-        # Counts have tails of their own: less of these would fall apart less.
-        residual = np.clip(residual, -most, most)
-    count = (len(residual) - 1) // 2
-    total = np.concatenate([[0.0], np.cumsum(np.abs(np.fft.rfft(residual))[1 : count + 1] ** 2)])
+    count, total = len(power), np.concatenate([[0.0], np.cumsum(power)])
     bands, width = [(1.0, 1.0, 0, 0)], count // 2
     while width >= NARROWEST:
         for begin in range(0, count - width + 1, width // 2):
@@ -164,5 +171,21 @@ def excess_band(estimate: Estimate) -> Band | None:
     seldom, ratio, *ends = min(bands)
     if seldom * len(bands) > SELDOM or ratio < EXCESS:
         return None
-    low, high = (k / (len(residual) * record.interval) for k in ends)
+    low, high = (k * spacing for k in ends)
     return Band(low, high, ratio)
+
+
+def _periodogram(estimate: Estimate) -> tuple[np.ndarray, float]:
+    """Power of what is left of a fit, whitened, at whole numbers of cycles a record from 1, and their spacing (Hz).
+
+    Mean 1 where the noise is as fitted; the far tails count no more than their bound.
+    """
+    record = estimate.record
+    residual = estimate.whitened[record.present]
+    most = TAIL * float(np.median(np.abs(residual))) / norm.isf(0.25)
+    if estimate.ratios.quantisation is None:
+        # Counts have tails of their own: less of these would fall apart less.
+        residual = np.clip(residual, -most, most)
+    count = (len(residual) - 1) // 2
+    power = np.abs(np.fft.rfft(residual))[1 : count + 1] ** 2 / len(residual)
+    return power, 1.0 / (len(residual) * record.interval)
