@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import replace
 from difflib import get_close_matches
 from typing import Any, NamedTuple
@@ -169,6 +169,11 @@ class GyroModel(eqx.Module):
                     continue
                 found += [Slot(i, name, j, declared.linear) for j in range(np.size(getattr(effect, name)))]
         return tuple(found)
+
+    def with_shapes_held(self, labels: Container[str] | None = None) -> GyroModel:
+        """The model with the shapes of some effects fixed at their values; of all if none are named."""
+        held = {(self.labels[slot.effect], slot.field) for slot in self.slots() if not slot.linear}
+        return replace(self, fixed=self.fixed | {key for key in held if labels is None or key[0] in labels})
 
     def _fields(self) -> list[tuple[int, str]]:
         return list(dict.fromkeys((s.effect, s.field) for s in self.slots()))

@@ -34,6 +34,7 @@ from gyromodel.diagnosis._session import (
     over_smooth_thermometers,
     over_unrounded,
     over_weighted,
+    shapes_held,
     without_axis,
 )
 from gyromodel.diagnosis._shapes import driver_shape, minimum_detectable, not_testable
@@ -204,6 +205,7 @@ def _diagnosed(
         say("judging each step on blocks left out", 0.62)
         selection = session.pruned(selection)
     findings += [selection.unresolved] if selection.unresolved else []
+    findings += shapes_held(selection.estimate, model)
     last = selection.estimate
     left = () if rounding.saw_tooth else (tails(last), dwells_apart(last, unit))
     findings += [line for line in (*left, noise_level(last)) if line]

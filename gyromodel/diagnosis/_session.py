@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.stats import chi2
 
-from gyromodel._checks import CampaignError, thermometers
+from gyromodel._checks import CampaignError, listed, thermometers
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._data import Data, read
@@ -27,6 +28,8 @@ from gyromodel.signals import Record, with_columns_known, with_smooth_thermomete
 
 # Nats that noise of thermometers may have cost from which on they are smoothed and searched again: it is an estimate.
 LOST = 0.5
+# Probability of sizes as large by chance above which an effect of the simulation does not show.
+UNSEEN = 0.01
 
 
 class Session:
@@ -92,6 +95,37 @@ def rises_for_good(before: tuple[float, float], *after: tuple[float, float]) -> 
     return bool(np.isfinite(after[0][0])) and all(rms > before[0] and score < before[1] for rms, score in known)
 
 
+def shapes_held(estimate: Estimate, model: GyroModel) -> list[str]:
+    """What is said of shapes of the simulation that a fit holds and the simulation leaves free."""
+    held = sorted({label for label, _ in estimate.model.fixed - model.fixed if label in model.labels})
+    said = f"No fit to these data determines the shape of the simulation's {listed(held)}: it is held."
+    return [said] if held else []
+
+
+def _fitted(record: Record, model: GyroModel, start: NoiseRatios | None) -> Estimate:
+    """The fit of a simulation; where none determines its shapes, those of effects that do not show are held."""
+    try:
+        return fit_record(record, model, start=start)
+    except EstimateError:
+        try:
+            held = fit_record(record, model.with_shapes_held(), start=start)
+        except EstimateError:
+            held = None
+        fewer = model.with_shapes_held([e for e in model.labels if held and not _shows(held, e)])
+        if fewer.fixed == model.fixed:
+            raise
+        return fit_record(record, fewer, start=start)
+
+
+def _shows(estimate: Estimate, label: str) -> bool:
+    """Whether the sizes of an effect differ from nothing; what has none always does."""
+    of = estimate.model.labels.index(label)
+    own = [i for i, slot in enumerate(estimate.model.slots()) if slot.linear and slot.effect == of]
+    values = np.asarray(estimate.model.vector())[own]
+    covariance = estimate.covariance[np.ix_(own, own)]
+    return not own or bool(chi2.sf(values @ np.linalg.solve(covariance, values), len(own)) < UNSEEN)
+
+
 def laid_out(
     record: Record,
     model: GyroModel,
@@ -113,7 +147,7 @@ def laid_out(
     Raises:
         EstimateError: the simulation cannot be fitted.
     """
-    baseline = fit_record(record, model, start=start)
+    baseline = _fitted(record, model, start)
     scanner = Scanner(
         record, build_bank(record), _grid(record, baseline), outliers=outliers, stated=baseline.noise_given, step=step
     )

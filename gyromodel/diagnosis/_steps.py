@@ -89,7 +89,10 @@ class Steps:
     noise: NoisePath = ()
 
     def fit(self, found: Sequence[Found]) -> Estimate | None:
-        """The simulation with everything found; shapes that cannot be estimated stay at the searched value."""
+        """The simulation with everything found; shapes that cannot be estimated stay at the searched value.
+
+        So do those of the simulation, at the fitted one, where there is no other fit: an effect that does not show.
+        """
         ratios = self.noise[min(len(found), len(self.noise) - 1)] if self.noise else None
         model, freed = self.baseline.model, [f.name for f in found if f.frees_noise]
         given = self.baseline.noise_given and not freed
@@ -101,8 +104,12 @@ class Steps:
         last = next((f for f in reversed(found) if f.effect is not None), None)
         start = self.scanner.grid.ratios.take(last.ranking.best_cell(last.name)) if last else None
         model = replace(model, noise=self.baseline.model.noise if given else {})
-        entangled = None
-        for attempt in (model, _shapes_held(model, found)):
+        searched, lost, entangled = _shapes_held(model, found), 0, None
+        last_resort = searched.with_shapes_held(self.baseline.model.labels)
+        attempts = {attempt.fixed: attempt for attempt in (model, searched, last_resort)}
+        for tried, attempt in enumerate(attempts.values()):
+            if attempt is last_resort and lost < tried:
+                break
             try:
                 # Another solver would be compiled anew for each model, and has rescued none that this one lost.
                 after = fit_record(
@@ -114,6 +121,7 @@ class Steps:
                     solver="levenberg_marquardt",
                 )
             except EstimateError:
+                lost += 1
                 continue
             if _negative(after, found):
                 continue

@@ -134,8 +134,7 @@ def fit_record(
         if given is not None or start is not None or not shapes:
             raise
         # Slow noise taken for white may pull shapes to where nothing shows: begin in that beside shapes as they are.
-        held = {(model.labels[s.effect], s.field) for s in model.slots() if not s.linear}
-        beside = _in_turns(record, replace(model, fixed=model.fixed | held), white, True, markov, solver)
+        beside = _in_turns(record, model.with_shapes_held(), white, True, markov, solver)
         return fit_record(record, model, start=beside.ratios, markov=markov, solver=solver, ordinary=ordinary)
     slow = any(float(r) > 0 for r in (estimate.ratios.flicker, estimate.ratios.walk, estimate.ratios.markov))
     if given is None and start is None and shapes and slow:

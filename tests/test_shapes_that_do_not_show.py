@@ -1,0 +1,49 @@
+"""A simulation may have effects with shapes that the data do not show: a search goes on beside them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+import gyromodel as gm
+
+ROWS = 900
+HELD = "No fit to these data determines the shape of the simulation's bias_warmup: it is held."
+
+
+def still(rng: np.random.Generator) -> gm.Campaign:
+    columns = {"time": np.arange(ROWS, dtype=float), "output": 5.0 + 0.3 * rng.standard_normal(ROWS)}
+    return gm.Campaign(columns, {"time": "s", "output": "deg/h"}, {"kind": "rate"})
+
+
+def turning(rng: np.random.Generator) -> gm.Campaign:
+    """Rates held for 300 s each, over a cycle of temperature, whose coefficient of 0.05 deg/h per degC is hidden."""
+    time = 10.0 * np.arange(ROWS)
+    temperature = 25.0 + 20.0 * np.sin(2.0 * np.pi * time / 6000.0)
+    rate = 3600.0 * np.repeat(rng.choice([-30.0, -10.0, 0.0, 10.0, 30.0], ROWS // 30), 30)
+    output = rate + 5.0 + 0.05 * (temperature - 25.0) + 0.3 * rng.standard_normal(ROWS)
+    columns = {"time": time, "rate": rate, "temperature": temperature, "output": output}
+    return gm.Campaign(
+        columns, {"time": "s", "rate": "deg/h", "temperature": "degC", "output": "deg/h"}, {"kind": "rate"}
+    )
+
+
+@pytest.mark.law
+def test_a_simulated_warm_up_that_is_not_there_is_adequate(rng: np.random.Generator):
+    """In two of five logs no fit determines its time."""
+    found = [gm.diagnose(still(rng), gm.model_from_effects(["bias", "bias_warmup"]), hold_out=False) for _ in range(12)]
+    adequate = sum(diagnosis.verdict == "adequate" for diagnosis in found)
+    assert binom.cdf(adequate, len(found), 0.98) > 1e-5
+    held = [HELD in diagnosis.findings for diagnosis in found]
+    assert 0 < sum(held) < len(held)
+    assert held == [("bias_warmup", "time_constant") in diagnosis.extended.model.fixed for diagnosis in found]
+
+
+@pytest.mark.parametrize("effect", ["bandwidth", "rate_hysteresis", "bias_warmup"])
+def test_what_is_hidden_is_found_beside_what_does_not_show(effect: str):
+    """In two of four such logs a fit with both was lost, and what was found was not named."""
+    for seed in (1, 3):
+        model = gm.model_from_effects(["bias", "scale_factor", effect])
+        found = gm.diagnose(turning(np.random.default_rng(seed)), model, hold_out=False)
+        assert [cause.effect for cause in found.causes] == ["bias_temperature"]
