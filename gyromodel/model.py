@@ -219,6 +219,11 @@ class GyroModel(eqx.Module):
         before = jnp.asarray(before)
         return jax.jvp(lambda u: self.told(u, signals), (before,), (jnp.ones_like(before),))[1]
 
+    def unknown(self, signals: Signals) -> dict[str, np.ndarray]:
+        """By effect, the samples at which what was before the record or in a gap still shows, where there are any."""
+        found = {effect.label: np.asarray(effect.unknown(signals)) for effect in self.effects}
+        return {label: rows for label, rows in found.items() if rows.any()}
+
     def ended(self, signals: Signals) -> np.ndarray:
         """Samples at which the output ends and follows nothing."""
         if all(effect.site != "output" for effect in self.effects):

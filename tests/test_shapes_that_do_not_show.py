@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import binom
 
 import gyromodel as gm
+from gyromodel.effects.thermal import BiasWarmup
 
 ROWS = 900
+WARM_UP = (np.deg2rad(2.0 / 3600.0),)
 HELD = "No fit to these data determines the shape of the simulation's bias_warmup: it is held."
 
 
@@ -47,3 +51,12 @@ def test_what_is_hidden_is_found_beside_what_does_not_show(effect: str):
         model = gm.model_from_effects(["bias", "scale_factor", effect])
         found = gm.diagnose(turning(np.random.default_rng(seed)), model, hold_out=False)
         assert [cause.effect for cause in found.causes] == ["bias_temperature"]
+
+
+def test_a_warm_up_stated_and_fixed_that_is_not_there(rng: np.random.Generator):
+    """Set free it stood beside itself, which no fit tells apart: the log was "unknown"."""
+    model = gm.model_from_effects(["bias"]).with_effect(BiasWarmup(amplitude=WARM_UP, time_constant=(300.0,)))
+    fixed = frozenset({("bias_warmup", "amplitude"), ("bias_warmup", "time_constant")})
+    found = gm.diagnose(still(rng), replace(model, fixed=fixed), hold_out=False)
+    assert "bias_warmup" in {cause.effect for cause in found.causes}
+    assert any("fixed in the simulation at a value that the data contradict" in line for line in found.findings)

@@ -48,6 +48,7 @@ from gyromodel.estimate import (
     fit_record,
     refuse_apart,
     refuse_missing,
+    unknown_rows,
     with_reading,
 )
 from gyromodel.model import GyroModel
@@ -127,6 +128,14 @@ def _diagnosed(
     readings, given = data.readings, model
     model, reading = readings.bare(given, measured, record)
     session = laid_out(record, model, step=data.step)
+    if record.domain == "gyro" and (rows := unknown_rows(session.baseline)):
+        names = listed(session.baseline.model.unknown(record.signals))
+        findings.append(
+            f"{len(rows)} samples next to gaps or the record's ends were left out beside {names} of the simulation: "
+            "what was not recorded still shows there."
+        )
+        record = record.without(np.array(rows))
+        session = laid_out(record, model, step=data.step)
     if (
         not readings.same_as(reading)
         and readings.coarse_beside(record, session.baseline)

@@ -4,6 +4,7 @@ from gyromodel.estimate._angle_noise import angle_noise, even_stretches
 from gyromodel.estimate._calibration import Calibration, validity_unit
 from gyromodel.estimate._estimate import Estimate, EstimateError, calibration_of, noise_table
 from gyromodel.estimate._fit import (
+    MOST_UNKNOWN,
     check_covariates,
     fit,
     fit_record,
@@ -11,6 +12,7 @@ from gyromodel.estimate._fit import (
     read_for_fit,
     refuse_apart,
     refuse_missing,
+    unknown_rows,
 )
 from gyromodel.estimate._function import FunctionFit, fit_function
 from gyromodel.estimate._many import ManyFits, fit_many
@@ -20,6 +22,7 @@ from gyromodel.estimate._two_stage import two_stage
 from gyromodel.estimate._whitening import filter_of, make_filter, pad_columns, whiten_columns
 
 __all__ = [
+    "MOST_UNKNOWN",
     "Calibration",
     "Estimate",
     "EstimateError",
@@ -45,6 +48,7 @@ __all__ = [
     "refuse_missing",
     "step_of",
     "two_stage",
+    "unknown_rows",
     "unrounded",
     "validity_unit",
     "whiten_columns",

@@ -37,6 +37,8 @@ Progress = Callable[[str, float], None] | None
 TOLERANCE = 1e-8
 # Relative size of a singular value of the whitened, column-scaled Jacobian below which a direction is not determined.
 SINGULAR = 1e-7
+# Part of the samples from which on none is given up for not being known to an effect.
+MOST_UNKNOWN = 0.25
 
 
 def fit(
@@ -51,7 +53,8 @@ def fit(
 
     Args:
         campaigns: measured data of one unit; of a multi-position test that numbers no positions, the static poses, and
-            where the reference rate comes from an attitude, means over 0.2 s.
+            where the reference rate comes from an attitude, means over 0.2 s. Samples at which an effect with memory
+            (a delay, a bandwidth) still shows what was before the record or in a gap are left out.
         model: what to fit; `noise` empty estimates white noise and flicker and random walk, or a Markov process,
             alongside.
         solver: the package's own Levenberg-Marquardt, or optimistix's; "auto" is its own and, where that does not
@@ -70,11 +73,23 @@ def fit(
     model, record = with_step_of(model, given), with_stated_level(record, model)
     if progress:
         progress("fitting", 0.1)
-    estimate = with_noise_intervals(fit_record(record, model, solver=solver))
+    estimate = fit_record(record, model, solver=solver)
+    if rows := unknown_rows(estimate):
+        known = record.without(np.array(rows))
+        estimate = fit_record(known, estimate.model_as_given(), start=estimate.ratios, solver=solver)
+    estimate = with_noise_intervals(estimate)
     estimate = replace(estimate, source=Source(name, float(estimate.degrees_of_freedom)))
     if progress:
         progress("fitted", 1.0)
     return estimate
+
+
+def unknown_rows(estimate: Estimate) -> tuple[int, ...]:
+    """The rows in use that an effect of the fitted model does not know, if they are few enough to be given up."""
+    record = estimate.record
+    unknown = estimate.model.unknown(record.signals).values()
+    rows = np.flatnonzero(record.present & np.logical_or.reduce([*unknown])[: record.rows]) if unknown else ()
+    return tuple(map(int, rows)) if len(rows) < MOST_UNKNOWN * record.present.sum() else ()
 
 
 def read_for_fit(campaigns: Sequence[Campaign]) -> Record:
