@@ -25,7 +25,7 @@ CACHE = ROOT / ".cache"
 VERDICTS = {f"test_{name}" for name in (
     "archive_effects", "diagnosis", "held_out", "honesty", "isolation", "memory_effects", "misfit", "monitors",
     "motion_effects", "noise_causes", "noise_identification", "platform_diagnosis", "poses", "report", "ring_laser",
-    "rounded_sweeps", "temperature_curves", "three_axes", "unlisted",
+    "rounded_sweeps", "temperature_curves", "thermometer_noise", "three_axes", "unlisted",
 )}  # fmt: skip
 
 # Whose verdicts are of one draw, the same in each run: they err as often as the threshold allows, which

@@ -80,9 +80,9 @@ def test_what_follows_no_thermometer_is_told_of_beside_it(beside: str, rng: np.r
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("size", [0.1, 0.3])
+@pytest.mark.parametrize("size", [0.2, 0.3])
 def test_a_bias_over_temperature_is_named_beside_a_simulated_rate_effect(size: float, rng: np.random.Generator):
-    """Of 3 and 8 deg/h from cold to warm: what thermometers leave of 100 deg/h is no function of the temperature."""
+    """Of 5 and 8 deg/h from cold to warm: what thermometers leave of 100 deg/h is no function of the temperature."""
     log = fiber_optic.log(fiber_optic.Gyro(gradient_rate=16000.0), HOURS, rng)
     bent = np.interp(log["temperature"], *(np.linspace(0, 60, 601), fiber_optic.bent_bias(np.linspace(0, 60, 601))))
     columns = means(log | {"output": log["output"] - bent})
