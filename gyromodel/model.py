@@ -221,7 +221,7 @@ class GyroModel(eqx.Module):
 
     def unknown(self, signals: Signals) -> dict[str, np.ndarray]:
         """By effect, the samples at which what was before the record or in a gap still shows, where there are any."""
-        found = {effect.label: np.asarray(effect.unknown(signals)) for effect in self.effects}
+        found = {effect.label: np.asarray(effect.unknown(signals)) for effect in self.effects if effect.remembers}
         return {label: rows for label, rows in found.items() if rows.any()}
 
     def ended(self, signals: Signals) -> np.ndarray:

@@ -35,6 +35,7 @@ from gyromodel.model import GyroModel
 from gyromodel.model_files import read_model
 from gyromodel.platform import fit_vibration
 from gyromodel.signals import read_signals
+from tests.test_begun_in_motion import log as in_motion
 
 MODEL = "effects: [{effect: bias}, {effect: bias_temperature}]\n"
 # Of two lengths, so that few shapes are compiled.
@@ -145,6 +146,37 @@ def test_stated_noise_is_fitted_together_as_each_by_itself(tmp_path: Path, monke
         for noise, found in estimate.noise_table().items():
             stored = mine[noise]
             assert (stored["value"], stored["low"], stored["high"]) == (found["value"], found["lo"], found["hi"])
+
+
+def test_what_begins_in_motion_is_fitted_together_as_each_by_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A lag still shows at first what was before the record: the same samples are left out."""
+    (tmp_path / "archive").mkdir()
+    effects = "{effect: bias}, {effect: scale_factor, value: 1}, {effect: bandwidth, time_constant: 0.5 s}"
+    noise = "{effect: noise_white, value: 0.038 deg/sqrt(h)}"
+    (tmp_path / "model.yaml").write_text(f"effects: [{effects}]\nnoise: [{noise}]\n")
+    logs = {f"c{k}.csv": in_motion(np.random.default_rng(k), lag=1.0) for k in range(2)}
+    for name, log in logs.items():
+        write_campaign(log, tmp_path / "archive" / name)
+    monkeypatch.setattr(work, "fit", None)
+    rows = here(tmp_path).table.to_pylist()
+    for name, log in logs.items():
+        expected = fit(log, read_model(tmp_path / "model.yaml"))
+        found = {r["parameter"]: r for r in rows if r["campaign"] == name}["bandwidth.time_constant"]
+        assert found["samples"] == expected.record.present.sum() < len(log)
+        assert found["value"] == pytest.approx(expected.table()[-1].value, abs=1e-3 * expected.table()[-1].std)
+
+
+def test_what_a_diagnosis_holds_has_no_row(tmp_path: Path):
+    (tmp_path / "archive").mkdir()
+    (tmp_path / "model.yaml").write_text(MODEL)
+    one = campaign(0)
+    still = one.with_column("temperature", np.full(len(one), 20.0), "degC")
+    noise = np.random.default_rng(1).standard_normal(len(one))
+    write_campaign(still.with_column("output", noise, "deg/h"), tmp_path / "archive" / "still.csv")
+    model = read_model(tmp_path / "model.yaml")
+    rows = run_batch(str(tmp_path / "archive"), model, "m", tmp_path / "r.parquet", diagnosing=True).table.to_pylist()
+    assert {(r["status"], r["verdict"]) for r in rows} == {("diagnosed", "adequate")}
+    assert not [r for r in rows if (r["parameter"] or "").startswith("bias_temperature")]
 
 
 def test_lots_are_of_a_size_in_memory():

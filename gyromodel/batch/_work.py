@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import fields
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ from gyromodel.batch._references import References, referred
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis import diagnose
 from gyromodel.effects import Effect
-from gyromodel.estimate import EstimateError, calibration_of, fit, fit_many, noise_table, read_for_fit
+from gyromodel.estimate import EstimateError, calibration_of, fit, fit_many, noise_table, read_for_fit, unknown_rows
 from gyromodel.files import read_campaign
 from gyromodel.model import GyroModel, ModelError
 from gyromodel.platform import fit_vibration, is_platform
@@ -115,6 +115,10 @@ def _together(axes: Sequence[Ready], model: GyroModel) -> dict[int, list[Row]]:
     if not records:
         return {}
     fits = fit_many(records.values(), model, restarts=False)
+    lost = [unknown_rows(record, fits.model(k)) for k, record in enumerate(records.values())]
+    if any(lost):
+        records = {i: records[i].without(np.array(rows, int)) for i, rows in zip(records, lost, strict=True)}
+        fits = fit_many(records.values(), model, restarts=False)
     may_differ = any(not slot.linear for slot in model.slots())
     found = {}
     for k, (i, record) in enumerate(records.items()):
@@ -147,18 +151,28 @@ def _rows(one: Ready, lot: Lot) -> list[Row]:
             estimate = fit_vibration([campaign], lot.model) if is_platform(campaign) else fit(campaign, lot.model)
             model, covariance = estimate.model, estimate.covariance
             head = head | {"status": "fitted"}
-        return _parameters(head, estimate.record, model, covariance, estimate.iterations, estimate.noise_interval)
+        held = {key for key in model.fixed - lot.model.fixed if key[0] in lot.model.labels}
+        return _parameters(head, estimate.record, model, covariance, estimate.iterations, estimate.noise_interval, held)
     except Exception as error:  # one campaign must not end the run
         return [failed(one.head, error)]
 
 
 def _parameters(
-    head: Row, record: Record, model: GyroModel, covariance: np.ndarray, iterations: int, noise: Any = None
+    head: Row,
+    record: Record,
+    model: GyroModel,
+    covariance: np.ndarray,
+    iterations: int,
+    noise: Any = None,
+    held: Container[tuple[str, str]] = (),
 ) -> list[Row]:
+    """A row for each parameter and noise coefficient, but for those that the campaign does not determine (`held`)."""
     head = head | {"samples": int(record.present.sum()), "iterations": iterations}
     of = {effect.label: _structure(effect) for effect in model.effects}
     rows, seen = [], Counter[tuple[str, str]]()
     for r in calibration_of(model, covariance, record, 0).table():
+        if (r.effect, r.name) in held:
+            continue
         seen[r.effect, r.name] += 1
         again = f"[{k}]" if (k := seen[r.effect, r.name]) > 1 else ""  # a second step, say
         name = f"{r.effect}{again}.{r.name}{of[r.effect]}"

@@ -28,13 +28,13 @@ from gyromodel.diagnosis._result import Cause, Diagnosis, ParameterValue
 from gyromodel.diagnosis._search import Progress
 from gyromodel.diagnosis._selection import Selection
 from gyromodel.diagnosis._session import (
+    held_back,
     laid_out,
     over_angle_noise,
     over_power_cycles,
     over_smooth_thermometers,
     over_unrounded,
     over_weighted,
-    shapes_held,
     without_axis,
 )
 from gyromodel.diagnosis._shapes import driver_shape, minimum_detectable, not_testable
@@ -128,7 +128,7 @@ def _diagnosed(
     readings, given = data.readings, model
     model, reading = readings.bare(given, measured, record)
     session = laid_out(record, model, step=data.step)
-    if record.domain == "gyro" and (rows := unknown_rows(session.baseline)):
+    if record.domain == "gyro" and (rows := unknown_rows(record, session.baseline.model)):
         names = listed(session.baseline.model.unknown(record.signals))
         findings.append(
             f"{len(rows)} samples next to gaps or the record's ends were left out beside {names} of the simulation: "
@@ -214,7 +214,7 @@ def _diagnosed(
         say("judging each step on blocks left out", 0.62)
         selection = session.pruned(selection)
     findings += [selection.unresolved] if selection.unresolved else []
-    findings += shapes_held(selection.estimate, model)
+    findings += held_back(selection.estimate, model)
     last = selection.estimate
     left = () if rounding.saw_tooth else (tails(last), dwells_apart(last, unit))
     findings += [line for line in (*left, noise_level(last)) if line]

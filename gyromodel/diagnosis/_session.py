@@ -28,6 +28,10 @@ from gyromodel.signals import Record, with_columns_known, with_smooth_thermomete
 
 # Nats that noise of thermometers may have cost from which on they are smoothed and searched again: it is an estimate.
 LOST = 0.5
+# What is told from the data before anything else.
+FIRST = ("bias", "scale_factor")
+# Part of a column that others do not make, up to which they stand for it.
+ALIKE = 1e-6
 # Probability of sizes as large by chance above which an effect of the simulation does not show.
 UNSEEN = 0.01
 
@@ -95,18 +99,24 @@ def rises_for_good(before: tuple[float, float], *after: tuple[float, float]) -> 
     return bool(np.isfinite(after[0][0])) and all(rms > before[0] and score < before[1] for rms, score in known)
 
 
-def shapes_held(estimate: Estimate, model: GyroModel) -> list[str]:
-    """What is said of shapes of the simulation that a fit holds and the simulation leaves free."""
-    held = sorted({label for label, _ in estimate.model.fixed - model.fixed if label in model.labels})
-    said = f"No fit to these data determines the shape of the simulation's {listed(held)}: it is held."
-    return [said] if held else []
+def held_back(estimate: Estimate, model: GyroModel) -> list[str]:
+    """What is said of parameters of the simulation that a fit holds and the simulation leaves free."""
+    held = [f"{label} ({name})" for label, name in sorted(estimate.model.fixed - model.fixed) if label in model.labels]
+    return [f"These data do not determine {listed(held)} of the simulation: held in the fit."] if held else []
 
 
 def _fitted(record: Record, model: GyroModel, start: NoiseRatios | None) -> Estimate:
-    """The fit of a simulation; where none determines its shapes, those of effects that do not show are held."""
+    """The fit of a simulation.
+
+    Where that fails, what the data do not excite, or cannot tell from what was stated before it, is held as stated; and
+    so are shapes of effects that do not show.
+    """
     try:
         return fit_record(record, model, start=start)
     except EstimateError:
+        fewer = _determined(record, model)
+        if fewer.fixed != model.fixed:
+            return _fitted(record, fewer, start)
         try:
             held = fit_record(record, model.with_shapes_held(), start=start)
         except EstimateError:
@@ -115,6 +125,33 @@ def _fitted(record: Record, model: GyroModel, start: NoiseRatios | None) -> Esti
         if fewer.fixed == model.fixed:
             raise
         return fit_record(record, fewer, start=start)
+
+
+def _determined(record: Record, model: GyroModel) -> GyroModel:
+    """The model with sizes fixed as stated that others stand for on a record: bias and scale factor, then in its order.
+
+    Parameters of one field are fixed together. Where what is not stated would have to be, nothing is.
+    """
+    ready = model.prepared(record.signals)
+    columns = np.asarray(ready.linearise(record.signals)[1])[: record.rows][record.present]
+    fields: dict[tuple[str, str], list[int]] = {}
+    for i, slot in enumerate(ready.slots()):
+        if slot.linear:
+            fields.setdefault((ready.labels[slot.effect], slot.field), []).append(i)
+    unstated = {(e.label, n) for e in model.effects for n in e.declared() if not np.isfinite(getattr(e, n)).all()}
+    known, held = np.zeros((len(columns), 0)), set()
+    for key in sorted(fields, key=lambda key: FIRST.index(key[0]) if key[0] in FIRST else len(FIRST)):
+        taken = known
+        for column in columns[:, fields[key]].T:
+            size = np.linalg.norm(column)
+            left = column - taken @ (taken.T @ column)
+            if np.linalg.norm(left) <= ALIKE * size:
+                held.add(key)
+                break
+            taken = np.column_stack([taken, left / np.linalg.norm(left)])
+        else:
+            known = taken
+    return model if held & unstated else replace(model, fixed=model.fixed | held)
 
 
 def _shows(estimate: Estimate, label: str) -> bool:

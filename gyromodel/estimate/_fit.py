@@ -74,7 +74,7 @@ def fit(
     if progress:
         progress("fitting", 0.1)
     estimate = fit_record(record, model, solver=solver)
-    if rows := unknown_rows(estimate):
+    if rows := unknown_rows(record, estimate.model):
         known = record.without(np.array(rows))
         estimate = fit_record(known, estimate.model_as_given(), start=estimate.ratios, solver=solver)
     estimate = with_noise_intervals(estimate)
@@ -84,10 +84,9 @@ def fit(
     return estimate
 
 
-def unknown_rows(estimate: Estimate) -> tuple[int, ...]:
-    """The rows in use that an effect of the fitted model does not know, if they are few enough to be given up."""
-    record = estimate.record
-    unknown = estimate.model.unknown(record.signals).values()
+def unknown_rows(record: Record, model: GyroModel) -> tuple[int, ...]:
+    """The rows in use that an effect of a fitted model does not know, if they are few enough to be given up."""
+    unknown = model.unknown(record.signals).values()
     rows = np.flatnonzero(record.present & np.logical_or.reduce([*unknown])[: record.rows]) if unknown else ()
     return tuple(map(int, rows)) if len(rows) < MOST_UNKNOWN * record.present.sum() else ()
 

@@ -1,4 +1,4 @@
-"""A simulation may have effects with shapes that the data do not show: a search goes on beside them."""
+"""A simulation may have what the data do not show: a search goes on beside it, and says that it was held."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import pytest
 from scipy.stats import binom
 
 import gyromodel as gm
+from gyromodel.effects.scale import ScaleFactor
 from gyromodel.effects.thermal import BiasWarmup
 
 ROWS = 900
 WARM_UP = (np.deg2rad(2.0 / 3600.0),)
-HELD = "No fit to these data determines the shape of the simulation's bias_warmup: it is held."
+HELD = "These data do not determine bias_warmup (time_constant) of the simulation: held in the fit."
 
 
 def still(rng: np.random.Generator) -> gm.Campaign:
@@ -60,3 +61,25 @@ def test_a_warm_up_stated_and_fixed_that_is_not_there(rng: np.random.Generator):
     found = gm.diagnose(still(rng), replace(model, fixed=fixed), hold_out=False)
     assert "bias_warmup" in {cause.effect for cause in found.causes}
     assert any("fixed in the simulation at a value that the data contradict" in line for line in found.findings)
+
+
+@pytest.mark.parametrize("drift", [0.0, 1e-3])
+def test_what_a_campaign_does_not_excite_stays_as_stated(drift: float, rng: np.random.Generator):
+    """A still gyro at one temperature, and the simulation of one that turns, warm and cold."""
+    campaign = still(rng)
+    time = campaign.columns["time"]
+    campaign = campaign.with_column("rate", np.zeros(ROWS), "deg/s").with_column(
+        "temperature", np.full(ROWS, 25.0), "degC"
+    )
+    campaign = campaign.with_column("output", campaign.columns["output"] + drift * time, "deg/h")
+    effects = ["bias", "scale_nonlinearity", "bias_temperature", "scale_temperature"]
+    model = gm.model_from_effects(effects).with_effect(ScaleFactor(value=1.002))
+    found = gm.diagnose(campaign, model)
+    assert {cause.effect for cause in found.causes} <= {"bias_drift", "noise_random_walk", "bias_warmup"}
+    assert found.verdict == ("ambiguous" if drift else "adequate")
+    held = (
+        "bias_temperature (coefficient), scale_factor (value), scale_nonlinearity (coefficients), scale_temperature ("
+    )
+    assert any(held in line for line in found.findings)
+    assert float(found.extended.model.gain()) == pytest.approx(1.002, rel=1e-12)
+    assert found.extended.table()[0].std > 0
