@@ -105,9 +105,10 @@ def fit_many(
     """Fit the free parameters of a model to each of many campaigns.
 
     Values are those of `fit_record` with the noise that the model states or, where it states none, with white noise of
-    unknown size: all samples count, also those that an effect with memory does not know. Noise is not identified here. Models with `quantisation` are refused: `fit` fits them. One program is
-    compiled for a model's structure and each power of two of the campaigns' lengths. Only the campaigns being fitted
-    are held in memory, so that `records` may be a generator.
+    unknown size: all samples count, also those that an effect with memory does not know. Noise is not identified here.
+    Models with `quantisation` are refused: `fit` fits them. One program is compiled for a model's structure and each
+    power of two of the campaigns' lengths. Only the campaigns being fitted are held in memory, so that `records` may be
+    a generator.
 
     Args:
         records: the campaigns' data.
