@@ -220,8 +220,12 @@ class GyroModel(eqx.Module):
         return jax.jvp(lambda u: self.told(u, signals), (before,), (jnp.ones_like(before),))[1]
 
     def unknown(self, signals: Signals) -> dict[str, np.ndarray]:
-        """By effect, the samples at which what was before the record or in a gap still shows, where there are any."""
-        found = {effect.label: np.asarray(effect.unknown(signals)) for effect in self.effects if effect.remembers}
+        """By effect that follows the rate late, samples at which one before the record or in a gap still shows.
+
+        Temperatures change slowly, and soak when a record begins: what lags behind them is known well enough.
+        """
+        late = [effect for effect in self.effects if effect.remembers and "rate" in effect.needs]
+        found = {effect.label: np.asarray(effect.unknown(signals)) for effect in late}
         return {label: rows for label, rows in found.items() if rows.any()}
 
     def ended(self, signals: Signals) -> np.ndarray:

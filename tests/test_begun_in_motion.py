@@ -12,7 +12,11 @@ import pytest
 from scipy.stats import norm
 
 import gyromodel as gm
-from gyromodel.effects.dynamics import TimeDelay
+from gyromodel.effects.dynamics import Bandwidth, TimeDelay
+from gyromodel.effects.thermal import BiasTemperatureRate
+from gyromodel.estimate import EstimateError, unknown_rows
+from gyromodel.model import GyroModel
+from gyromodel.signals import read_signals
 
 ROWS, STEP, BIAS, NOISE = 2000, 0.1, 1e-3, 2e-3
 # deg/s, Hz, rad
@@ -43,12 +47,32 @@ def test_a_fit_leaves_out_what_it_cannot_know(effect: str, true: dict[str, float
         assert 0 < found.to_dict()["missing"] < 100
 
 
+def test_a_lag_behind_temperatures_keeps_its_soak():
+    """What warms up with the power does so in the first minutes, when temperatures stand still."""
+    time = 10.0 * np.arange(200)
+    columns = {"time": time, "rate": np.sin(time), "temperature": np.maximum(time - 500.0, 0.0), "output": time}
+    units = {"time": "s", "rate": "deg/s", "temperature": "degC", "output": "deg/s"}
+    record = read_signals([gm.Campaign(columns, units, {"kind": "rate"})])
+    assert unknown_rows(record, GyroModel((BiasTemperatureRate(lag=np.array([60.0])),), {})) == ()
+    assert unknown_rows(record, GyroModel((Bandwidth(time_constant=5.0),), {})) == (0, 1, 2, 3)
+    assert unknown_rows(record, GyroModel((Bandwidth(time_constant=0.01),), {})) == ()
+
+
+def test_a_run_that_is_shorter_than_the_memory_is_told_of(rng: np.random.Generator):
+    """Its bias had been fitted where the lag made up what was before it: all of them were wrong by 16 uncertainties."""
+    long, short = log(rng, lag=0.5), log(rng, lag=0.5)
+    short = gm.Campaign({name: values[:30] for name, values in short.columns.items()}, short.units, short.metadata)
+    model = gm.model_from_effects(["bias", "scale_factor", "bandwidth", "bias_turn_on"])
+    with pytest.raises(EstimateError, match="the 70 samples whose past bandwidth would have to know: bias_turn_on"):
+        gm.fit([long, short], model)
+
+
 def test_what_the_simulation_cannot_know_is_no_step(rng: np.random.Generator):
     """A delay that is as stated: the first samples had been named two steps of the bias."""
     model = gm.model_from_effects(["bias", "scale_factor"]).with_effect(TimeDelay(delay=0.3))
     found = gm.diagnose(log(rng, delay=0.3), replace(model, fixed=FIXED), hold_out=False)
     assert (found.verdict, found.causes) == ("adequate", ())
-    said = "3 samples next to gaps or the record's ends were left out beside time_delay of the simulation"
+    said = f"Beside time_delay of the simulation 3 of {ROWS} samples were left out"
     assert any(line.startswith(said) for line in found.findings)
 
 

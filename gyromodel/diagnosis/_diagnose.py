@@ -28,7 +28,6 @@ from gyromodel.diagnosis._result import Cause, Diagnosis, ParameterValue
 from gyromodel.diagnosis._search import Progress
 from gyromodel.diagnosis._selection import Selection
 from gyromodel.diagnosis._session import (
-    held_back,
     laid_out,
     over_angle_noise,
     over_power_cycles,
@@ -39,6 +38,7 @@ from gyromodel.diagnosis._session import (
 )
 from gyromodel.diagnosis._shapes import driver_shape, minimum_detectable, not_testable
 from gyromodel.diagnosis._thermometers import within_thermometers
+from gyromodel.diagnosis._unseen import held_back
 from gyromodel.diagnosis._variance import follow, growing_noise, noise_level, tails
 from gyromodel.diagnosis._verdict import FAINT, judge
 from gyromodel.estimate import (
@@ -131,11 +131,12 @@ def _diagnosed(
     if record.domain == "gyro" and (rows := unknown_rows(record, session.baseline.model)):
         names = listed(session.baseline.model.unknown(record.signals))
         findings.append(
-            f"{len(rows)} samples next to gaps or the record's ends were left out beside {names} of the simulation: "
-            "what was not recorded still shows there."
+            f"Beside {names} of the simulation {len(rows)} of {record.present.sum()} samples were left out, next to "
+            "gaps or the record's ends: what was not recorded still shows there."
         )
         record = record.without(np.array(rows))
         session = laid_out(record, model, step=data.step)
+    model = replace(model, fixed=session.baseline.model.fixed)
     if (
         not readings.same_as(reading)
         and readings.coarse_beside(record, session.baseline)
@@ -214,7 +215,7 @@ def _diagnosed(
         say("judging each step on blocks left out", 0.62)
         selection = session.pruned(selection)
     findings += [selection.unresolved] if selection.unresolved else []
-    findings += held_back(selection.estimate, model)
+    findings += held_back(selection.estimate, given)
     last = selection.estimate
     left = () if rounding.saw_tooth else (tails(last), dwells_apart(last, unit))
     findings += [line for line in (*left, noise_level(last)) if line]

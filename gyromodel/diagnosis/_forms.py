@@ -18,7 +18,7 @@ from gyromodel.diagnosis._tangents import Tangent
 from gyromodel.effects import Effect
 from gyromodel.effects.converter import BiasReadoutCode
 from gyromodel.effects.drivers import BiasPeriodic, BiasStep
-from gyromodel.estimate import MOST_UNKNOWN, Estimate
+from gyromodel.estimate import Estimate
 from gyromodel.model import GyroModel
 from gyromodel.signals import Record
 
@@ -35,6 +35,8 @@ HARMONICS, HARMONIC_MARGIN, DETUNED, MIDDLE = 256, 4.0, 2.0, range(13, 20)
 LEAST_DISTINCT = 1e-9
 # A fit with a gain smaller than this part of the simulation's is none.
 LEAST_GAIN = 0.01
+# Part of the samples that may be given up because an effect does not know what was before them.
+MOST_UNKNOWN = 0.25
 
 
 def addition(

@@ -127,8 +127,9 @@ def lines_of_noise(estimate: Estimate) -> list[bool]:
     energies, margin, found = line_energies(estimate), NARROWEST * spacing, list[bool]()
     for line, energy in zip(lines, energies, strict=True):
         nearest = np.argsort(np.abs((1 + np.arange(len(power))) * spacing - line.frequency))[:BESIDE]
-        mean = float(np.mean(power[nearest]))
-        chance = max(chi2.sf(energy / band.ratio, 2), f.sf(energy / 2 / mean, 2, 2 * len(nearest)))
+        # Of a median, which other lines do not raise.
+        mean = float(np.median(power[nearest])) / np.log(2.0)
+        chance = max(chi2.sf(energy / band.ratio, 2), f.sf(energy / 2 / mean, 2, len(nearest)))
         about = band.low - margin <= line.frequency <= band.high + margin
         found.append(about and bool(chance * estimate.record.rows / 2 > SELDOM))
     return found
@@ -183,7 +184,7 @@ def _periodogram(estimate: Estimate) -> tuple[np.ndarray, float]:
     record = estimate.record
     residual = estimate.whitened[record.present]
     most = TAIL * float(np.median(np.abs(residual))) / norm.isf(0.25)
-    if estimate.ratios.quantisation is None:
+    if estimate.ratios.quantisation is None or not most > 0.0:
         # Counts have tails of their own: less of these would fall apart less.
         residual = np.clip(residual, -most, most)
     count = (len(residual) - 1) // 2

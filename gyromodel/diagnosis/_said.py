@@ -65,8 +65,10 @@ def told(
     if any(isinstance(step.effect, BiasPeriodic) for step in found) and (also := _aliases(extended)):
         yield also
     held: dict[str, list[str]] = {}
+    labels = {step.effect.label for step in found if step.effect is not None}
     for label, shape in sorted(extended.model.fixed - steps.baseline.model.fixed):
-        held.setdefault(label, []).append(shape)
+        if label in labels:
+            held.setdefault(label, []).append(shape)
     for label, shapes in held.items():
         yield (
             f"{' and '.join(shapes)} of {label} stayed where the search had put them, as they could not be estimated: "

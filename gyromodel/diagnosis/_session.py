@@ -7,9 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.stats import chi2
 
-from gyromodel._checks import CampaignError, listed, thermometers
+from gyromodel._checks import CampaignError, thermometers
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._bank import build_bank
 from gyromodel.diagnosis._data import Data, read
@@ -20,6 +19,7 @@ from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import Progress, search, steadied
 from gyromodel.diagnosis._selection import Selection, significant_driver
 from gyromodel.diagnosis._steps import EXCHANGE, NoisePath, Steps, standing
+from gyromodel.diagnosis._unseen import fitted
 from gyromodel.diagnosis._variance import Growth, with_variance
 from gyromodel.estimate import Estimate, EstimateError, Unrounded, fit_record
 from gyromodel.model import GyroModel
@@ -28,12 +28,6 @@ from gyromodel.signals import Record, with_columns_known, with_smooth_thermomete
 
 # Nats that noise of thermometers may have cost from which on they are smoothed and searched again: it is an estimate.
 LOST = 0.5
-# What is told from the data before anything else.
-FIRST = ("bias", "scale_factor")
-# Part of a column that others do not make, up to which they stand for it.
-ALIKE = 1e-6
-# Probability of sizes as large by chance above which an effect of the simulation does not show.
-UNSEEN = 0.01
 
 
 class Session:
@@ -99,70 +93,6 @@ def rises_for_good(before: tuple[float, float], *after: tuple[float, float]) -> 
     return bool(np.isfinite(after[0][0])) and all(rms > before[0] and score < before[1] for rms, score in known)
 
 
-def held_back(estimate: Estimate, model: GyroModel) -> list[str]:
-    """What is said of parameters of the simulation that a fit holds and the simulation leaves free."""
-    held = [f"{label} ({name})" for label, name in sorted(estimate.model.fixed - model.fixed) if label in model.labels]
-    return [f"These data do not determine {listed(held)} of the simulation: held in the fit."] if held else []
-
-
-def _fitted(record: Record, model: GyroModel, start: NoiseRatios | None) -> Estimate:
-    """The fit of a simulation.
-
-    Where that fails, what the data do not excite, or cannot tell from what was stated before it, is held as stated; and
-    so are shapes of effects that do not show.
-    """
-    try:
-        return fit_record(record, model, start=start)
-    except EstimateError:
-        fewer = _determined(record, model)
-        if fewer.fixed != model.fixed:
-            return _fitted(record, fewer, start)
-        try:
-            held = fit_record(record, model.with_shapes_held(), start=start)
-        except EstimateError:
-            held = None
-        fewer = model.with_shapes_held([e for e in model.labels if held and not _shows(held, e)])
-        if fewer.fixed == model.fixed:
-            raise
-        return fit_record(record, fewer, start=start)
-
-
-def _determined(record: Record, model: GyroModel) -> GyroModel:
-    """The model with sizes fixed as stated that others stand for on a record: bias and scale factor, then in its order.
-
-    Parameters of one field are fixed together. Where what is not stated would have to be, nothing is.
-    """
-    ready = model.prepared(record.signals)
-    columns = np.asarray(ready.linearise(record.signals)[1])[: record.rows][record.present]
-    fields: dict[tuple[str, str], list[int]] = {}
-    for i, slot in enumerate(ready.slots()):
-        if slot.linear:
-            fields.setdefault((ready.labels[slot.effect], slot.field), []).append(i)
-    unstated = {(e.label, n) for e in model.effects for n in e.declared() if not np.isfinite(getattr(e, n)).all()}
-    known, held = np.zeros((len(columns), 0)), set()
-    for key in sorted(fields, key=lambda key: FIRST.index(key[0]) if key[0] in FIRST else len(FIRST)):
-        taken = known
-        for column in columns[:, fields[key]].T:
-            size = np.linalg.norm(column)
-            left = column - taken @ (taken.T @ column)
-            if np.linalg.norm(left) <= ALIKE * size:
-                held.add(key)
-                break
-            taken = np.column_stack([taken, left / np.linalg.norm(left)])
-        else:
-            known = taken
-    return model if held & unstated else replace(model, fixed=model.fixed | held)
-
-
-def _shows(estimate: Estimate, label: str) -> bool:
-    """Whether the sizes of an effect differ from nothing; what has none always does."""
-    of = estimate.model.labels.index(label)
-    own = [i for i, slot in enumerate(estimate.model.slots()) if slot.linear and slot.effect == of]
-    values = np.asarray(estimate.model.vector())[own]
-    covariance = estimate.covariance[np.ix_(own, own)]
-    return not own or bool(chi2.sf(values @ np.linalg.solve(covariance, values), len(own)) < UNSEEN)
-
-
 def laid_out(
     record: Record,
     model: GyroModel,
@@ -184,7 +114,7 @@ def laid_out(
     Raises:
         EstimateError: the simulation cannot be fitted.
     """
-    baseline = _fitted(record, model, start)
+    baseline = fitted(record, model, start)
     scanner = Scanner(
         record, build_bank(record), _grid(record, baseline), outliers=outliers, stated=baseline.noise_given, step=step
     )

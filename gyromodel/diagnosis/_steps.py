@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from gyromodel.diagnosis._forms import addition, not_known
 from gyromodel.diagnosis._one_cell import CLEARLY
 from gyromodel.diagnosis._ranking import Ranking, is_noise, rank_where_it_matters
 from gyromodel.diagnosis._scan import Scanner
+from gyromodel.diagnosis._unseen import beside_unseen
 from gyromodel.effects import Effect
 from gyromodel.estimate import Estimate, EstimateError, fit_record
 from gyromodel.model import GyroModel
@@ -91,7 +93,7 @@ class Steps:
     def fit(self, found: Sequence[Found]) -> Estimate | None:
         """The simulation with everything found; shapes that cannot be estimated stay at the searched value.
 
-        So do those of the simulation, at the fitted one, where there is no other fit: an effect that does not show.
+        So do those of the simulation, at the fitted value, where there is no other fit and they do not show.
         """
         ratios = self.noise[min(len(found), len(self.noise) - 1)] if self.noise else None
         model, freed = self.baseline.model, [f.name for f in found if f.frees_noise]
@@ -104,22 +106,18 @@ class Steps:
         last = next((f for f in reversed(found) if f.effect is not None), None)
         start = self.scanner.grid.ratios.take(last.ranking.best_cell(last.name)) if last else None
         model = replace(model, noise=self.baseline.model.noise if given else {})
-        searched, lost, entangled = _shapes_held(model, found), 0, None
-        last_resort = searched.with_shapes_held(self.baseline.model.labels)
-        attempts = {attempt.fixed: attempt for attempt in (model, searched, last_resort)}
-        for tried, attempt in enumerate(attempts.values()):
-            if attempt is last_resort and lost < tried:
-                break
+        how: dict[str, Any] = {
+            "ratios": ratios,
+            "start": start,
+            "markov": "noise_markov" in freed if freed else None,
+            # Another solver would be compiled anew for each model, and has rescued none that this one lost.
+            "solver": "levenberg_marquardt",
+        }
+        entangled, lost, searched = None, 0, _shapes_held(model, found)
+        attempts = (model,) if searched.fixed == model.fixed else (model, searched)
+        for attempt in attempts:
             try:
-                # Another solver would be compiled anew for each model, and has rescued none that this one lost.
-                after = fit_record(
-                    data,
-                    attempt,
-                    ratios=ratios,
-                    start=start,
-                    markov="noise_markov" in freed if freed else None,
-                    solver="levenberg_marquardt",
-                )
+                after = fit_record(data, attempt, **how)
             except EstimateError:
                 lost += 1
                 continue
@@ -128,7 +126,11 @@ class Steps:
             if not _entangled(after):
                 return after
             entangled = after
-        return entangled
+        if lost < len(attempts):
+            return entangled
+        simulated = set(self.baseline.model.labels) - {f.effect.label for f in found if f.effect is not None}
+        after = beside_unseen(data, searched, simulated, **how)
+        return None if after is None or _negative(after, found) else after
 
     def rank_beside(self, estimate: Estimate, found: Sequence[Found], columns: np.ndarray) -> Ranking:
         """All candidates beside a fit with what was found and beside further columns, which explain what they can."""

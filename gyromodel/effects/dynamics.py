@@ -179,9 +179,9 @@ def resolved(signals: Signals, name: str = "rate") -> bool:
 
 
 def remembered(time: Float[Array, " sample"], time_constant: Float[Array, ""]) -> Bool[Array, " sample"]:
-    """Samples at which a lag has not forgotten what was before the stretch."""
+    """Samples at which a lag has not forgotten what was before the stretch: none if it is far below their interval."""
     clock, first, _ = _clock(time)
-    return clock - clock[first] < FORGOTTEN * time_constant
+    return clock - clock[first] < FORGOTTEN * time_constant - 0.5 * _usual(time)
 
 
 def _usual(time: Float[Array, " sample"]) -> Float[Array, ""]:

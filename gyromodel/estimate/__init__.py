@@ -4,7 +4,6 @@ from gyromodel.estimate._angle_noise import angle_noise, even_stretches
 from gyromodel.estimate._calibration import Calibration, validity_unit
 from gyromodel.estimate._estimate import Estimate, EstimateError, calibration_of, noise_table
 from gyromodel.estimate._fit import (
-    MOST_UNKNOWN,
     check_covariates,
     fit,
     fit_record,
@@ -22,7 +21,6 @@ from gyromodel.estimate._two_stage import two_stage
 from gyromodel.estimate._whitening import filter_of, make_filter, pad_columns, whiten_columns
 
 __all__ = [
-    "MOST_UNKNOWN",
     "Calibration",
     "Estimate",
     "EstimateError",

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gyromodel._checks import CampaignError
+from gyromodel._checks import CampaignError, listed
 from gyromodel._model_units import check_domain, check_units
 from gyromodel._noise_level import with_stated_level
 from gyromodel.attitude import refuse_navigated, with_reference_rates
@@ -37,8 +37,8 @@ Progress = Callable[[str, float], None] | None
 TOLERANCE = 1e-8
 # Relative size of a singular value of the whitened, column-scaled Jacobian below which a direction is not determined.
 SINGULAR = 1e-7
-# Part of the samples from which on none is given up for not being known to an effect.
-MOST_UNKNOWN = 0.25
+# Part of the samples from which on none is left out for not being known to an effect.
+MOST_UNKNOWN = 0.5
 
 
 def fit(
@@ -53,8 +53,8 @@ def fit(
 
     Args:
         campaigns: measured data of one unit; of a multi-position test that numbers no positions, the static poses, and
-            where the reference rate comes from an attitude, means over 0.2 s. Samples at which an effect with memory
-            (a delay, a bandwidth) still shows what was before the record or in a gap are left out.
+            where the reference rate comes from an attitude, means over 0.2 s. Samples at which a delay or a bandwidth
+            still shows what was before the record or in a gap are left out where they are less than half.
         model: what to fit; `noise` empty estimates white noise and flicker and random walk, or a Markov process,
             alongside.
         solver: the package's own Levenberg-Marquardt, or optimistix's; "auto" is its own and, where that does not
@@ -76,7 +76,12 @@ def fit(
     estimate = fit_record(record, model, solver=solver)
     if rows := unknown_rows(record, estimate.model):
         known = record.without(np.array(rows))
-        estimate = fit_record(known, estimate.model_as_given(), start=estimate.ratios, solver=solver)
+        try:
+            estimate = fit_record(known, estimate.model_as_given(), start=estimate.ratios, solver=solver)
+        except EstimateError as problem:
+            late = listed(estimate.model.unknown(record.signals))
+            lost = f"without the {len(rows)} samples whose past {late} would have to know"
+            raise EstimateError(f"{lost}: {problem}") from None
     estimate = with_noise_intervals(estimate)
     estimate = replace(estimate, source=Source(name, float(estimate.degrees_of_freedom)))
     if progress:

@@ -1,0 +1,97 @@
+"""What a simulation has and the data do not show: held in fits, so that a search goes on beside it, and told of."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from gyromodel._checks import listed
+from gyromodel.estimate import Estimate, EstimateError, filter_of, fit_record, pad_columns, whiten_columns
+from gyromodel.model import GyroModel
+from gyromodel.noise import NoiseRatios
+from gyromodel.signals import Record
+
+# What every gyro has: what shows as these alone does is held at the stated value.
+FIRST = ("bias", "scale_factor")
+# Part of a column that others do not make, up to which they stand for it.
+ALIKE = 1e-6
+# Probability of sizes as large by chance above which an effect does not show.
+UNSEEN = 0.01
+
+
+def fitted(record: Record, model: GyroModel, start: NoiseRatios | None = None) -> Estimate:
+    """The fit of a simulation; where that fails, with what the data do not show held as stated.
+
+    Raises:
+        EstimateError: there is no such fit either, or what would have to be held is not stated.
+    """
+    try:
+        return fit_record(record, model, start=start)
+    except EstimateError:
+        fewer = _determined(record, model)
+        if fewer.fixed != model.fixed:
+            return fitted(record, fewer, start)
+        found = beside_unseen(record, model, model.labels, start=start)
+        if found is None:
+            raise
+        return found
+
+
+def beside_unseen(record: Record, model: GyroModel, labels: Collection[str], **how: Any) -> Estimate | None:
+    """The fit with the shapes held of those among some effects that do not show; None where none helps."""
+    try:
+        held = fit_record(record, model.with_shapes_held(labels), **how)
+        fewer = model.with_shapes_held([label for label in labels if not _shows(held, label)])
+        return fit_record(record, fewer, **how) if fewer.fixed != model.fixed else None
+    except EstimateError:
+        return None
+
+
+def held_back(estimate: Estimate, model: GyroModel) -> list[str]:
+    """What is said of parameters of the simulation that a fit holds and the simulation leaves free."""
+    held = [f"{label} ({name})" for label, name in sorted(estimate.model.fixed - model.fixed) if label in model.labels]
+    said = f"These data do not determine {listed(held)} of the simulation: held, and all else holds beside just that."
+    return [said] if held else []
+
+
+def _determined(record: Record, model: GyroModel) -> GyroModel:
+    """The model with sizes fixed that the data do not excite, or that show as the bias and the scale factor do.
+
+    Parameters of one field are fixed together. Where one would have to be that is not stated, nothing is.
+    """
+    ready = model.prepared(record.signals)
+    columns = np.asarray(ready.linearise(record.signals)[1])[: record.rows][record.present]
+    fields: dict[tuple[str, str], list[int]] = {}
+    for i, slot in enumerate(ready.slots()):
+        if slot.linear:
+            fields.setdefault((ready.labels[slot.effect], slot.field), []).append(i)
+    unstated = {(e.label, n) for e in model.effects for n in e.declared() if not np.isfinite(getattr(e, n)).all()}
+    known, held = np.zeros((len(columns), 0)), set()
+    for key in sorted(fields, key=lambda key: FIRST.index(key[0]) if key[0] in FIRST else len(FIRST)):
+        own = columns[:, fields[key]]
+        left = own - known @ (known.T @ own)
+        if (np.linalg.norm(left, axis=0) <= ALIKE * np.linalg.norm(own, axis=0)).any():
+            held.add(key)
+        elif key[0] in FIRST:
+            known = np.column_stack([known, np.linalg.qr(left)[0]])
+    return model if held & unstated else replace(model, fixed=model.fixed | held)
+
+
+def _shows(estimate: Estimate, label: str) -> bool:
+    """Whether an effect's free sizes differ from nothing; of one without, whether what it adds does."""
+    model, record = estimate.model, estimate.record
+    of = model.labels.index(label)
+    own = [i for i, slot in enumerate(model.slots()) if slot.linear and slot.effect == of]
+    if own:
+        values = np.asarray(model.vector())[own]
+        energy = float(values @ np.linalg.solve(estimate.covariance[np.ix_(own, own)], values))
+    else:
+        signals = record.signals
+        added = np.where(record.sampling.present, model.predict(signals) - model.without(label).predict(signals), 0.0)
+        white = np.asarray(whiten_columns(filter_of(record, estimate.ratios), pad_columns(added[:, None])))[:, 0]
+        energy = float(white @ white) / max(estimate.white_variance, np.finfo(float).tiny)
+    return bool(chi2.sf(energy, max(len(own), 1)) < UNSEEN)
