@@ -61,9 +61,12 @@ def held_back(estimate: Estimate, model: GyroModel) -> list[str]:
 def _determined(record: Record, model: GyroModel) -> GyroModel:
     """The model with sizes fixed that the data do not excite, or that show as the bias and the scale factor do.
 
-    Parameters of one field are fixed together. Where one would have to be that is not stated, nothing is.
+    Parameters of one field are fixed together. Where one would have to be that is not stated, nothing is. Beside sizes
+    of zero the scale factor is told by rates alone, not by the stated size of another error.
     """
     ready = model.prepared(record.signals)
+    added = np.array([slot.linear and ready.effects[slot.effect].site != "gain" for slot in ready.slots()], bool)
+    ready = ready.with_vector(np.where(added, 0.0, np.asarray(ready.vector())))
     columns = np.asarray(ready.linearise(record.signals)[1])[: record.rows][record.present]
     fields: dict[tuple[str, str], list[int]] = {}
     for i, slot in enumerate(ready.slots()):
