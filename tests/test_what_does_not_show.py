@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -126,3 +127,22 @@ def test_what_a_campaign_does_not_excite_stays_as_stated(size: float, rng: np.ra
     assert any(all(part in line for part in held) for line in found.findings)
     assert float(found.extended.model.gain()) == pytest.approx(1.002, rel=1e-12)
     assert found.extended.table()[0].std > 0
+
+
+CURVE = """effects:
+- {effect: bias, value: 5 deg/h}
+- effect: bias_temperature_curve
+  coefficients: [37 deg/h]
+  hinges: [-2.5 deg/h/degC, 3.3 deg/h/degC]
+  breakpoints: [22.7 degC, 31.2 degC]
+  reference: 25 degC
+"""
+
+
+def test_a_curve_over_a_temperature_that_stands_still(rng: np.random.Generator, tmp_path: Path):
+    """Bends and slopes of the simulation stay where they are: what they add here is the bias's."""
+    (tmp_path / "model.yaml").write_text(CURVE)
+    log = still(rng).with_column("temperature", np.full(ROWS, 25.0), "degC")
+    found = gm.diagnose(log, gm.read_model(tmp_path / "model.yaml"), hold_out=False)
+    assert found.verdict == "adequate"
+    assert any("bias_temperature_curve (breakpoints)" in line for line in found.findings)

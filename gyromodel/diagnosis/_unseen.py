@@ -81,7 +81,11 @@ def _determined(record: Record, model: GyroModel) -> GyroModel:
             held.add(key)
         elif key[0] in FIRST:
             known = np.column_stack([known, np.linalg.qr(left)[0]])
-    return model if held & unstated else replace(model, fixed=model.fixed | held)
+    if held & unstated:
+        return model
+    # Without a size to be told, no shape is.
+    shapeless = {label for label, _ in held} - {label for label, _ in fields.keys() - held}
+    return replace(model, fixed=model.fixed | held).with_shapes_held(shapeless)
 
 
 def _shows(estimate: Estimate, label: str) -> bool:
