@@ -37,7 +37,7 @@ def log(rng: np.random.Generator, lag: float = 0.0, delay: float = 0.0) -> gm.Ca
 
 @pytest.mark.parametrize(("effect", "true"), [("bandwidth", {"lag": 1.0}), ("time_delay", {"delay": 0.3})])
 def test_a_fit_leaves_out_what_it_cannot_know(effect: str, true: dict[str, float], rng: np.random.Generator):
-    """With the first samples the lag was 13 standard uncertainties off; each is within 4 here but for interpolation."""
+    """With the first samples the lag was 12 standard uncertainties off; each is within 4 here but for interpolation."""
     (expected,) = true.values()
     for _ in range(3):
         found = gm.fit(log(rng, **true), gm.model_from_effects(["bias", "scale_factor", effect]))
