@@ -45,6 +45,7 @@ def write_page(output: Path, whole: list[Kept]) -> None:
     reached += levels.outside_levels(parts["effects 3, outside"])
     reached += levels.unknown_levels(uncatalogued) + levels.pair_levels(parts["pairs"] + parts["pairs, moving"])
     reached += levels.amplitude_levels(main_sizes) + levels.ambiguity_levels(parts["inseparable"], parts["drifts"])
+    reached += levels.superfluous_levels(parts["nothing, superfluous"], parts["effects 10, superfluous"])
     reached += [levels.settled_level(parts["inseparable"]), levels.noise_level(nulls)]
     reached += [levels.adequacy_level(sized[3.0]), levels.claim_level(parts["forced"])]
     reached += levels.gain_coverage(sized[3.0])
@@ -378,7 +379,7 @@ def _never_hidden() -> list[str]:
 
 def _missed(records: list[study.Record]) -> list[str]:
     """Every campaign of some that was not answered right, to draw it again."""
-    wrong = [r for r in records if r.score and r.answer and not r.score.right]
+    wrong = [r for r in records if not (r.score and r.score.right)]
     lines = [
         "## Answers that were not right",
         "",
@@ -386,9 +387,8 @@ def _missed(records: list[study.Record]) -> list[str]:
         "|---|---|---|---|---|---|",
     ]
     for r in sorted(wrong, key=lambda r: (str(r.case.effect), r.case.design)):
-        said = f"{r.answer.verdict} {', '.join(r.answer.causes) or ' and '.join(r.answer.driver)}" if r.answer else ""
-        isolable = "yes" if r.isolable else "no"
-        lines.append(
-            f"| {r.case.seed} | {r.case.design} | {r.case.noise} | {r.case.effect or '–'} | {isolable} | {said} |"
-        )
+        told = r.answer and (r.answer.verdict, ", ".join(r.answer.causes) or " and ".join(r.answer.driver))
+        said, isolable = " ".join(told or ("refused",)), "yes" if r.isolable else "no"
+        hidden = ", simulated beside ".join(filter(None, (r.case.effect or "–", ", ".join(r.case.superfluous))))
+        lines.append(f"| {r.case.seed} | {r.case.design} | {r.case.noise} | {hidden} | {isolable} | {said} |")
     return [*lines, ""]

@@ -86,7 +86,7 @@ def _record(stored: dict[str, Any]) -> Record:
     if answer:
         answer["sizes"] = {k: _tuples(v) for k, v in stored["answer"]["sizes"].items()}
     return Record(**stored | {
-        "case": Case(**stored["case"]),
+        "case": Case(**{k: _tuples(v) for k, v in stored["case"].items()}),
         "truth": truth,
         "answer": Answer(**answer) if answer else None,
         "score": Score(**stored["score"]) if stored["score"] else None,

@@ -36,6 +36,7 @@ from tests.truth.noise import FAMILY, OUTSIDE
 RESULTS = Path(__file__).parent / "results"
 # Campaigns at full scale, by what is hidden in them.
 NULLS, EFFECTS, CURVE, OUTER, UNKNOWNS, PAIRS = 400, 600, 200, 150, 300, 400
+SUPERFLUOUS = 150  # with nothing hidden, and with an effect
 MOVING = 48  # of unlisted errors, and of pairs, of gyros that are tumbled, turned and driven
 INSEPARABLE, CALIBRATED, MUTATED = 120, 200, 60
 # However small the part, so many of what is counted in few campaigns.
@@ -136,6 +137,8 @@ def _plan(seed: int, scale: float, controls: Sequence[str]) -> Iterator[tuple[st
     yield "pairs, moving", study.moving_pair_cases(many(MOVING), seed + 91, 3.0), {}
     yield "inseparable", study.inseparable_cases(few(INSEPARABLE), seed + 30), {"after": True}
     yield "drifts", study.drift_cases(few(INSEPARABLE), seed + 31), {}
+    for label, size in (("nothing", 0.0), ("effects 10", 10.0)):
+        yield f"{label}, superfluous", study.superfluous_cases(many(SUPERFLUOUS), seed + 45 + bool(size), size), {}
     # With a safeguard off, and the same campaigns with it on.
     broken = study.null_cases(many(MUTATED), seed + 40, ("flicker_and_walk",), (A, B, C))
     whole = study.curve_cases(many(MUTATED), seed + 41, 3.0)

@@ -29,6 +29,7 @@ NULLS, MOVING, STRANGE = 40, 10, 10  # in noise of the family, the same on the m
 NAMES = len({e for d in HOMES for e in TESTABLE[d]})
 EFFECTS_1, EFFECTS_3, EFFECTS_10 = 20, 60, 20  # other effects each run
 UNKNOWN_3, UNKNOWN_10 = 16, 8  # of 8 uncatalogued effects
+SUPERFLUOUS = 12  # with nothing hidden, and with an effect
 RETRIES = 5  # further draws of an effect that was missed once
 WORKERS = 1 if "PYTEST_XDIST_WORKER" in os.environ else 2
 
@@ -94,6 +95,12 @@ def test_uncatalogued_effects_are_unknown_and_their_driver_is_found(seed):
     cases = study.unknown_cases(UNKNOWN_3, seed, 3.0) + study.unknown_cases(UNKNOWN_10, seed + 1, 10.0)
     records = study.run_cases(cases, WORKERS)
     _require(levels.pooled(levels.unknown_levels(records)), records, seed)
+
+
+@pytest.mark.long
+def test_simulated_effects_that_are_not_there_mislead_nobody(seed):
+    records = [study.run_cases(study.superfluous_cases(SUPERFLUOUS, seed, size), WORKERS) for size in (0.0, 10.0)]
+    _require(levels.superfluous_levels(*records), [*records[0], *records[1]], seed)
 
 
 # Fast and slow effects in noise of each kind.

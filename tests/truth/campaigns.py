@@ -56,6 +56,22 @@ UNCATALOGUED: dict[str, tuple[str, ...]] = {
     "dynamic_rates": ("temperature_ripple", "rate_ripple", "vibration_ripple"),
 }
 
+# What a simulation may have besides, whether or not the campaign shows it: all but what has a place to be stated.
+_MORE = ("bias_drift", "bias_warmup", "scale_nonlinearity", "scale_temperature", "rate_hysteresis", "time_delay")
+STATED = {
+    design: tuple(dict.fromkeys(e for e in (*TESTABLE[design], *_MORE) if e not in ("bias_step", "bias_periodic")))
+    for design in (A, B, C, *MOTION)
+}
+# Where one of these is simulated, it takes up much of another that is hidden.
+ALIKE = (
+    {"bias_temperature", "bias_temperature_curve"},
+    {"bias_temperature_rate", "bias_thermal_hysteresis", "bias_temperature_product"},
+    {"scale_factor", "scale_asymmetry", "scale_nonlinearity", "scale_sagnac_sine", "rate_hysteresis"},
+    {"scale_temperature", "scale_temperature_curve", "scale_drift"},
+    {"time_delay", "bandwidth", "rate_hysteresis", "output_axis_acceleration"},
+    {"table_tilt", "table_harmonic", "bias_magnetic"},
+)
+
 
 @dataclass(frozen=True)
 class Truth:

@@ -213,6 +213,19 @@ def outside_levels(records: list[Record]) -> list[Level]:
     ]  # fmt: skip
 
 
+def superfluous_levels(nothing: list[Record], hidden: list[Record]) -> list[Level]:
+    """Rows 1, 5+ and 6 where the simulation has effects that the gyro has not; a refusal is not a right answer."""
+    beside = "one to four effects simulated that are not there"
+    right = [bool(r.score and r.score.right) for r in hidden]
+    wrong = [bool(r.score and r.score.firm_and_wrong) for r in hidden]
+    said = [not (r.score and r.score.right) for r in nothing]
+    return [
+        _level("1", f"false extension, {beside}", "–", 0.02, False, said),
+        _level("5+", f"right verdict, 10×, {beside}", "–", 0.92, True, right),
+        _level("6", f"firm and wrong, 10×, {beside}", "–", 0.01, False, wrong),
+    ]
+
+
 def _mean(values: list[bool]) -> float:
     return float(np.mean(values)) if values else float("nan")
 

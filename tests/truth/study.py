@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 from scipy.special import logsumexp
 
 from . import contest
-from .campaigns import HOMES, LOOP, MOTION, RUNS, TESTABLE, UNCATALOGUED, A, B, C, Truth, hide, known
+from .campaigns import ALIKE, HOMES, LOOP, MOTION, RUNS, STATED, TESTABLE, UNCATALOGUED, A, B, C, Truth, hide, known
 from .designs import DESIGNS, Design
 from .effects import error
 from .laws import Told, tell
@@ -45,6 +45,7 @@ class Case:
     noise: str
     effect: str | None = None
     times_mde: float = 0.0
+    superfluous: tuple[str, ...] = ()  # effects of the simulation that the gyro has not
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,7 @@ class Built:
     design: Design
     noise: Noise
     seed: int
+    simulated: tuple[str, ...]  # effects of the model that the engine starts from
 
 
 @dataclass(frozen=True)
@@ -86,13 +88,14 @@ def build(case: Case, noise_of: NoiseOf | None = None) -> Built:
     rng = np.random.default_rng(case.seed)
     design = (DESIGNS | MOTION_DESIGNS)[case.design](rng)
     noise = noise_of(case.noise, design) if noise_of else draw(case.noise, design, rng)
-    return Built(*hide(case.effect, design, noise, case.times_mde, rng), design, noise, case.seed)
+    hidden = hide(case.effect, design, noise, case.times_mde, rng)
+    return Built(*hidden, design, noise, case.seed, (*hidden[-1].baseline, *case.superfluous))
 
 
 def run_engine(
     built: Built, *, gain: bool = False, calibrate: int = 0, after: bool = False, mutant: str = ""
-) -> Answer:
-    """The only place that calls the package.
+) -> Answer | None:
+    """The only place that calls the package; None where it refuses a simulation for what that has besides.
 
     Args:
         built: the campaign.
@@ -106,9 +109,14 @@ def run_engine(
     from gyromodel.units import factor, internal_unit
 
     campaign = gyromodel.Campaign(columns=built.columns, units=built.units, metadata=built.metadata)
-    model = gyromodel.model_from_effects(list(built.truth.baseline))
-    with mutated(mutant):
-        found = gyromodel.diagnose(campaign, model, hold_out=gain, calibrate=calibrate)
+    model = gyromodel.model_from_effects(list(built.simulated))
+    try:
+        with mutated(mutant):
+            found = gyromodel.diagnose(campaign, model, hold_out=gain, calibrate=calibrate)
+    except EstimateError:
+        if built.simulated == built.truth.baseline:
+            raise
+        return None
     sizes = {}
     for cause in (c for c in found.causes if c.parameters):
         size = cause.parameters[0]
@@ -291,7 +299,7 @@ def moving_pair_cases(count: int, seed: int, times_mde: float, noises: Iterable[
     return _in_order(cells, count, seed, times_mde)
 
 
-def _in_order(cells: list[tuple[str, str, str]], count: int, seed: int, times_mde: float) -> list[Case]:
+def _in_order(cells: Sequence[tuple[str, str, str | None]], count: int, seed: int, times_mde: float) -> list[Case]:
     order = np.random.default_rng(seed).permutation(len(cells))
     return [Case(s, *cells[order[i % len(cells)]], times_mde) for i, s in enumerate(_seeds(seed, count))]
 
@@ -301,6 +309,21 @@ def inseparable_cases(count: int, seed: int) -> list[Case]:
     effects, noises = TESTABLE["static_ramp"], FAMILY[:3]
     cells = [(n, e) for n in noises for e in effects]
     return [Case(s, "static_ramp", *cells[i % len(cells)], 3.0) for i, s in enumerate(_seeds(seed, count))]
+
+
+def superfluous_cases(count: int, seed: int, times_mde: float) -> list[Case]:
+    """One to four effects of the simulation that the gyro has not, and nothing hidden, or one other effect in turn."""
+    rng = np.random.default_rng(seed)
+    hidden = {d: [e for e in TESTABLE[d] if e not in SLOW] if times_mde else [None] for d in STATED}
+    cells = [(d, n, e) for d in STATED for n in FAMILY for e in hidden[d]]
+    cases = []
+    for case in _in_order(cells, count, seed, times_mde):
+        chosen: list[str] = []
+        for name in rng.permutation([e for e in STATED[case.design] if e not in ("bias", "scale_factor", case.effect)]):
+            if not any(name in group and group & {case.effect, *chosen} for group in ALIKE):
+                chosen.append(str(name))
+        cases.append(replace(case, superfluous=tuple(chosen[: rng.integers(1, 5)])))
+    return cases
 
 
 def drift_cases(count: int, seed: int) -> list[Case]:
