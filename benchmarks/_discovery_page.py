@@ -297,8 +297,15 @@ def _beside_names(records: list[study.Record]) -> list[str]:
 
 
 def asked(label: str, records: list[study.Record]) -> list[study.Record]:
-    """The campaigns of a part that the oracle is asked about: of unknown effects those that were not flagged."""
-    return [r for r in records if not label.startswith("unknown 10") or not (r.score and r.score.called_unknown)]
+    """The campaigns of a part that the oracle is asked about: of effects those that the engine has not told right."""
+    scored = [(r, s) for r in records if (s := r.score)]
+    if label.startswith("unknown 10"):
+        return [r for r, score in scored if not score.called_unknown]
+    if label.startswith("effects 10"):
+        return [r for r in levels.alone(records) if r.score and not r.score.named]
+    if label.startswith("effects 1"):
+        return [r for r, score in scored if score.called_unknown]
+    return records
 
 
 def _bounds(parts: dict[str, list[study.Record]], told: dict[str, list[Told]]) -> list[str]:
@@ -311,9 +318,12 @@ def _bounds(parts: dict[str, list[study.Record]], told: dict[str, list[Told]]) -
         counted["2", f"something said, {noise.replace('_', ' ')}"] = said
     if "unknown 10" in both:
         missed = both["unknown 10"] + both.get("unknown 10, moving", [])
-        told_of = [t.evidence for _, t in missed if "smooth" in t.evidence]
-        ahead = [evidence["smooth"] == max(evidence.values()) for evidence in told_of]
-        counted["8", "flagged of those not flagged here, 10×, told the column but not its function"] = ahead
+        counted["8", "flagged of those not flagged here, 10×, told the column but not its function"] = _ahead(missed)
+    mistaken = both.get("effects 1", []) + both.get("effects 1, white", [])
+    counted["9", "flagged of those called unknown here, 1×, told the column that was named"] = _ahead(mistaken)
+    not_named = both.get("effects 10", []) + both.get("effects 10, white", [])
+    more = [bool(t.said) for _, t in not_named]
+    counted["5", "something said besides of those not named here, 10×, told the hidden effect but not its size"] = more
     inseparable = [len(t.said) > 1 and r.case.effect in t.said for r, t in both.get("inseparable", [])]
     counted["12", "ambiguous with the truth"] = inseparable
     counted["14", "noise class"] = [max(t.kinds, key=t.kinds.__getitem__) == r.case.noise for r, t in nulls]
@@ -323,6 +333,12 @@ def _bounds(parts: dict[str, list[study.Record]], told: dict[str, list[Told]]) -
         for (row, measure), flags in counted.items()
         if flags
     ]
+
+
+def _ahead(both: list[tuple[study.Record, Told]]) -> list[bool]:
+    """Where an oracle has a function of the column ahead of every name, of campaigns where it knows the column."""
+    known = [t.evidence for _, t in both if "smooth" in t.evidence]
+    return [evidence["smooth"] == max(evidence.values()) for evidence in known]
 
 
 def _mutants(parts: dict[str, list[study.Record]]) -> tuple[list[str], list[str]]:

@@ -19,6 +19,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from importlib.util import find_spec
 from multiprocessing import get_context
 from pathlib import Path
@@ -42,7 +43,10 @@ INSEPARABLE, CALIBRATED, MUTATED = 120, 200, 60
 # However small the part, so many of what is counted in few campaigns.
 FEWEST = 24
 # Parts that an oracle is asked about which knows how levels of noise are drawn.
-ORACLE = ("nothing", "nothing, moving", "inseparable", "unknown 10", "unknown 10, moving")
+ORACLE = (
+    "nothing", "nothing, moving", "inseparable", "unknown 10", "unknown 10, moving", "effects 1", "effects 1, white",
+    "effects 10", "effects 10, white",
+)  # fmt: skip
 DRAWS = 200  # of a calibration whose p-values are looked at
 # Diagnoses timed: campaigns of about 1000 rows.
 TIMED = ("static_cycle", "rate_temperature", "rate_steps", "tumble")
@@ -193,8 +197,8 @@ def main(argv: list[str] | None = None) -> None:
             kept.save()
             print(f"{label}: {len(cases)} campaigns, {time.time() - start:.0f} s", file=sys.stderr, flush=True)
         for label in (label for label in ORACLE if label not in kept.oracle):
-            cases = [r.case for r in asked(label, kept.parts[label])]
-            kept.oracle[label] = study.in_processes(study.oracle_told, cases, args.workers)
+            told = partial(study.oracle_told, beside=label.startswith("effects 10"))
+            kept.oracle[label] = study.in_processes(told, asked(label, kept.parts[label]), args.workers)
             kept.save()
             print(f"{label}, the oracle: {time.time() - start:.0f} s", file=sys.stderr, flush=True)
         if args.again:

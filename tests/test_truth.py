@@ -438,5 +438,8 @@ def test_oracle_says_names_that_hold_95_percent():
 @pytest.mark.long
 @pytest.mark.parametrize(("effect", "first"), [("temperature_ripple", "smooth"), ("bias_step", "bias_step")])
 def test_oracle_tells_what_is_unlisted_by_its_column(effect: str, first: str):
-    evidence = study.oracle_told(study.Case(1, B, "white", effect, 10.0)).evidence
+    record = study.run_case(study.Case(1, B, "white", effect, 10.0), engine=False)
+    evidence = study.oracle_told(record).evidence
     assert max(evidence, key=evidence.__getitem__) == first
+    assert max(evidence.values()) > laws.NEEDED
+    assert max(study.oracle_told(record, beside=True).evidence.values()) < laws.NEEDED

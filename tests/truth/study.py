@@ -32,7 +32,7 @@ Array = np.ndarray
 SLOW = ("bias_drift", "bias_step", "bias_warmup")
 # The noise of a kind on a design.
 NoiseOf = Callable[[str, Design], Noise]
-T = TypeVar("T")
+S, T = TypeVar("S"), TypeVar("T")
 CONTROLS = ("least_squares_f", "hac_f", "stepwise_bic", "lasso", "boosted_trees")
 
 
@@ -150,18 +150,25 @@ def run_engine(
     )
 
 
-def oracle_told(case: Case) -> Told:
+def oracle_told(record: Record, *, beside: bool = False) -> Told:
     """What an oracle tells of a campaign that knows how levels are drawn, and what column the unlisted follows.
 
-    Of that the function is smooth at some length, as far as anybody knows: its evidence is that of "smooth".
+    Of that the function is smooth at some length, as far as anybody knows: its evidence is that of "smooth". Where a
+    listed effect was called unknown, the column is the one that the engine has named. `beside` the hidden effect, which
+    is then known but for its size, it tells what more there is.
     """
-    built = build(case)
+    built = build(record.case)
     design, truth = built.design, built.truth
     data = np.deg2rad(built.columns["output"]) - design.true["rate"]
     none = np.zeros((len(data), 0))
     fixed = np.column_stack([none, *(error(name, design, 1.0, {}) for name in truth.baseline)])
-    smooths = contest.smooths(design, truth.driver) if truth.driver else {}
-    told = tell(data, design, fixed, contest.everything(design, case.effect) | smooths)
+    signals = contest.everything(design, record.case.effect)
+    if beside:
+        fixed = np.column_stack([fixed, truth.error / np.abs(truth.error).max()])
+        signals = {name: block for name, block in signals.items() if name not in parts(truth.effect)}
+    driver = truth.driver or (record.answer.driver if record.answer and known(truth.effect) else ())
+    smooths = contest.smooths(design, driver) if driver else {}
+    told = tell(data, design, fixed, signals | smooths)
     if not smooths:
         return told
     names = {name: value for name, value in told.evidence.items() if name not in smooths}
@@ -364,7 +371,7 @@ def run_cases(cases: list[Case], workers: int = 1, **options: Any) -> list[Recor
     return in_processes(partial(run_case, **options), cases, workers)
 
 
-def in_processes(function: Callable[[Case], T], cases: list[Case], workers: int) -> list[T]:
+def in_processes(function: Callable[[S], T], cases: list[S], workers: int) -> list[T]:
     """What a function makes of each case, in fresh processes when there are several workers (JAX does not fork)."""
     if workers == 1:
         return [function(case) for case in cases]
