@@ -163,11 +163,12 @@ def _again(kept: Kept, count: int, workers: int) -> tuple[str, int, int]:
     """
     plain = ("nothing", "effects", "unknown", "pairs", "inseparable", "drifts")
     labels = [label for label in kept.parts if label.startswith(plain) and label != "effects 3, white"]
-    before = [r for label in labels for r in kept.parts[label] if r.answer]
+    before = [r for label in labels for r in kept.parts[label]]
     before = [before[i] for i in np.random.default_rng(0).permutation(len(before))[:count]]
 
     def said(record: study.Record) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
-        assert record.answer
+        if record.answer is None:
+            return "refused", (), ()
         return record.answer.verdict, tuple(sorted(record.answer.causes)), record.answer.driver
 
     after = study.run_cases([r.case for r in before], workers)

@@ -32,7 +32,8 @@ Array = np.ndarray
 SLOW = ("bias_drift", "bias_step", "bias_warmup")
 # The noise of a kind on a design.
 NoiseOf = Callable[[str, Design], Noise]
-S, T = TypeVar("S"), TypeVar("T")
+S = TypeVar("S")
+T = TypeVar("T")
 CONTROLS = ("least_squares_f", "hac_f", "stepwise_bic", "lasso", "boosted_trees")
 
 
