@@ -227,9 +227,11 @@ def test_intervals_cover_independently_simulated_noise(rng: np.random.Generator)
     for name, hits in inside.items():
         assert binom.cdf(sum(hits), len(hits), 0.95) > RARE, (name, sum(hits))
     assert np.median(ratio["noise_white"]) == pytest.approx(1.0, abs=0.1)
+    # Of 800 draws each: below a tenth 15 and 27 %, above 1.7 1 and 7 %, reach beyond four times 0 and 9 %.
     for name in ("noise_flicker", "noise_random_walk"):
-        assert 0.1 < np.median(ratio[name]) < 1.7, ratio[name]
-        assert np.median(reach[name]) < 4.0, reach[name]
+        value, high = np.array(ratio[name]), np.array(reach[name])
+        for outside, share in ((value < 0.1, 0.3), (value > 1.7, 0.1), (high > 4.0, 0.1)):
+            assert binom.sf(outside.sum() - 1, len(outside), share) > RARE, (name, value, high)
 
 
 @pytest.mark.parametrize("N", [0.0, 4e-5])
