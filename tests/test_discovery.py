@@ -97,6 +97,44 @@ def test_uncatalogued_effects_are_unknown_and_their_driver_is_found(seed):
     _require(levels.pooled(levels.unknown_levels(records)), records, seed)
 
 
+@pytest.mark.parametrize(
+    ("case", "rival"),
+    [
+        (study.Case(1308870012687667, "turntable", "random_walk", "table_tilt", 1.0), "smooth(azimuth)"),
+        (study.Case(112539721501679, "dynamic_rates", "flicker", "misalignment", 1.0), "smooth(rate_output)"),
+    ],
+)
+def test_a_function_that_hardly_leads_a_name_leaves_it_in_doubt(case: study.Case, rival: str):
+    """Faint effects whose noise is explained better, by some 3 nats, by any function of the same column."""
+    assert case.effect
+    built = study.build(case)
+    campaign = gm.Campaign(columns=built.columns, units=built.units, metadata=built.metadata)
+    found = gm.diagnose(campaign, gm.model_from_effects(list(built.simulated)), hold_out=False)
+    first = {c.effect: c.statistic for c in found.rounds[0].ranking}
+    assert 2.0 < first[rival] - first[case.effect] < 4.0
+    assert (found.verdict, set(found.credible_set)) == ("ambiguous", {case.effect, rival})
+    assert [c.effect for c in found.causes] == [case.effect]
+    assert found.driver is None
+    assert f"Vary {rival[7:-1]} alone" in (found.next_test or "")
+
+
+@pytest.mark.parametrize(
+    ("case", "more"),
+    [
+        (study.Case(186840208047135, "repeated_runs", "white", "bias_turn_on", 10.0), "bias_warmup"),
+        (study.Case(3860921528123872, "tumble", "flicker", "bias_acceleration_squared", 1.0), "smooth(rate_output)"),
+    ],
+)
+def test_what_more_there_may_be_beside_a_name_needs_more_than_the_first(case: study.Case, more: str):
+    """Of noise alone a name and a function have some nats beside what is hidden, which would do for a first cause."""
+    built = study.build(case)
+    campaign = gm.Campaign(columns=built.columns, units=built.units, metadata=built.metadata)
+    found = gm.diagnose(campaign, gm.model_from_effects(list(built.simulated)), hold_out=False)
+    beside = {c.effect: c.statistic for c in found.rounds[1].ranking}
+    assert beside[more] > found.threshold + 0.5
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", [case.effect])
+
+
 @pytest.mark.long
 def test_simulated_effects_that_are_not_there_mislead_nobody(seed):
     records = [study.run_cases(study.superfluous_cases(SUPERFLUOUS, seed, size), WORKERS) for size in (0.0, 10.0)]

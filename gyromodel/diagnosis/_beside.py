@@ -76,7 +76,7 @@ def beside_driver(steps: Steps, selection: Selection) -> Selection:
     if not added and not any(f.beside for f in found):
         return selection
     last = steps.rank(estimates[-1], found)
-    if significant_driver(last, steps.threshold) != driver:
+    if significant_driver(last, steps.threshold, bool(found)) != driver:
         return selection
     as_before = [*map(id, found[: len(before)])] == [*map(id, before)]
     left_out = dict(selection.left_out) if as_before else {}

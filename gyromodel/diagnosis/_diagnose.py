@@ -40,7 +40,7 @@ from gyromodel.diagnosis._shapes import driver_shape, minimum_detectable, not_te
 from gyromodel.diagnosis._thermometers import within_thermometers
 from gyromodel.diagnosis._unseen import held_back
 from gyromodel.diagnosis._variance import follow, growing_noise, noise_level, tails
-from gyromodel.diagnosis._verdict import FAINT, judge
+from gyromodel.diagnosis._verdict import FAINT, judge, test_of_driver
 from gyromodel.estimate import (
     Estimate,
     EstimateError,
@@ -297,6 +297,9 @@ def _diagnosed(
     if instead and "bias_warmup" in extended.model.labels:
         findings.append(TURNED_ON)
         judgement = undecided(judgement, "bias_warmup", instead, TELL_RUNS)
+    if selection.rival and judgement.causes:
+        rival, first = selection.rival, judgement.causes[0].effect
+        judgement = undecided(judgement, first, rival, test_of_driver(rival))
     gain = (
         not_measured(unit)
         if not hold_out

@@ -23,6 +23,10 @@ from gyromodel.estimate import Estimate
 
 Progress = Callable[[str, float], None] | None
 
+# Nats by which a driver leads all names together to take their place; where it leads by EXCHANGE, either may be true.
+INSTEAD = 4.0
+# Nats by which two that show together lead one that may stand for both.
+TOGETHER = 1.0
 # More steps than this are a function of time that nobody explains by naming each.
 MAXIMUM_STEPS = 3
 
@@ -88,7 +92,8 @@ def _rounds(steps: Steps, progress: Progress, avoid: str = "") -> Selection:
             ranking = steps.rank(after, [step])
             break
     driver, score = path[0].ranking.best(drivers=True) if path else (None, -np.inf)
-    if score > threshold and _lead(steps, str(driver), path, ranking) > EXCHANGE:
+    lead = _lead(steps, str(driver), path, ranking) if score > threshold else -np.inf
+    if lead > INSTEAD:
         # One smooth driver explains more than all the names together; names of its own columns may have had to stand
         # back behind one that follows several of them.
         own, first = {measured(column)[0] for column in smooth_columns(str(driver))}, path[0].effect
@@ -115,9 +120,17 @@ def _rounds(steps: Steps, progress: Progress, avoid: str = "") -> Selection:
     there = {name: ranking.statistic[name] for name in lost if name in ranking.statistic}
     there = {name: score for name, score in there.items() if _significant(steps, ranking, name, score)}
     remains = remains or max(there, key=lambda name: there[name], default="")
-    driver = significant_driver(ranking, threshold)
     return Selection(
-        estimates[-1], tuple(found), tuple(path), ranking, tuple(estimates), driver, left_out, remains, small
+        estimates[-1],
+        tuple(found),
+        tuple(path),
+        ranking,
+        tuple(estimates),
+        significant_driver(ranking, threshold, bool(found)),
+        left_out,
+        remains,
+        small,
+        rival=driver if lead > EXCHANGE else None,
     )
 
 
@@ -133,7 +146,7 @@ def steadied(steps: Steps, selection: Selection) -> Selection:
         found=tuple(found),
         last=ranking,
         estimates=(*selection.estimates[:-1], estimate),
-        driver=significant_driver(ranking, steps.threshold),
+        driver=significant_driver(ranking, steps.threshold, bool(found)),
         left_out={},
         remains="bias_periodic" if said else selection.remains,
         unresolved=said,
@@ -142,7 +155,7 @@ def steadied(steps: Steps, selection: Selection) -> Selection:
 
 def _ahead_of(further: list[Found], threshold: float) -> str | None:
     """A driver that, where further names were begun with, surely explains more than all of these together."""
-    driver = significant_driver(further[0].ranking, threshold)
+    driver = significant_driver(further[0].ranking, threshold, True)
     if driver is None or any(f.points or f.frees_noise for f in further):
         return None
     lead = further[0].ranking.statistic[driver] - sum(f.ranking.statistic[f.name] for f in further)
@@ -183,13 +196,13 @@ def _together(
 ) -> list[tuple[Found, Estimate]]:
     """Two candidates, none barred, that are significant together, with their fits; none: there are no such.
 
-    Where another is significant alone, the two are to do better than it by the odds of a further cause, and by what it
-    may lose for its shape.
+    Where another is significant alone, the two are to do better than it by `TOGETHER`, and by what it may lose for its
+    shape.
     """
     pair, score = best_pair(steps.scanner, ranking, barred)
     if pair is None or score < max(steps.least(ranking, name) for name in pair):
         return []
-    if alone and (alone in pair or score < (1.0 + BETWEEN) * ranking.statistic[alone] + FURTHER):
+    if alone and (alone in pair or score < (1.0 + BETWEEN) * ranking.statistic[alone] + TOGETHER):
         return []
     one = replace(steps.step(path, estimate, ranking, pair[0]), paired=True)
     first = steps.fit(standing([*path, one]))
@@ -203,7 +216,7 @@ def _together(
     if both is None or not steps.keeps(first, other, both):
         return []
     # Of what takes an earlier one's place, the evidence is what it explains without that.
-    after, least = [*path, one, other], steps.least(ranking, other.name) + FURTHER
+    after, least = [*path, one, other], steps.least(ranking, other.name) + TOGETHER
     replaces = len(standing(after)) < len(after)
     if replaces and path and not steps.fits_better(standing(after), standing(path), least):
         return []

@@ -10,7 +10,7 @@ from gyromodel.estimate import Estimate
 
 MAXIMUM_ROUNDS = 12
 # Nats that a further cause needs more than the first: of something wrong one cause is likelier than two.
-FURTHER = 1.0
+FURTHER = 2.0
 
 
 @dataclass(frozen=True)
@@ -20,6 +20,7 @@ class Selection:
     `left_out` holds rankings beside everything found except one, where the search has made them; `remains` names what
     was still significant and not added, `beside_it` is the fit with it where there is one, and `unresolved` says why if
     it is too small. `alone` is the ranking beside the simulation where the path begins beside a driver's function.
+    `rival` is a driver that explains more than the names do, but not by enough to take their place.
     """
 
     estimate: Estimate
@@ -33,6 +34,7 @@ class Selection:
     unresolved: str = ""
     beside_it: Estimate | None = field(default=None, repr=False)
     alone: Ranking | None = field(default=None, repr=False)
+    rival: str | None = None
 
     @property
     def first(self) -> Ranking:
@@ -50,7 +52,7 @@ class Selection:
         return self.last.statistic[self.driver] if self.driver else 0.0
 
 
-def significant_driver(ranking: Ranking, threshold: float) -> str | None:
-    """The leading smooth driver, if it is significant."""
+def significant_driver(ranking: Ranking, threshold: float, further: bool) -> str | None:
+    """The leading smooth driver, if it is significant, `further` to something that was found."""
     driver, score = ranking.best(drivers=True)
-    return driver if driver and score >= threshold + ranking.more_needed(driver) else None
+    return driver if driver and score >= threshold + ranking.more_needed(driver) + FURTHER * further else None

@@ -65,7 +65,7 @@ class Session:
                 found = tuple(standing(path))
                 ranking = self.steps.rank(kept[-1], found) if step.beside else step.ranking
                 # What was cut may have stood for a driver that was ahead of it.
-                driver = significant_driver(ranking, self.threshold)
+                driver = significant_driver(ranking, self.threshold, True)
                 if driver and ranking.statistic[driver] < ranking.statistic[step.name] + EXCHANGE:
                     driver = None
                 cut = Selection(
@@ -78,6 +78,7 @@ class Session:
                     remains=step.name,
                     beside_it=estimates[i],
                     alone=selection.alone,
+                    rival=selection.rival,
                 )
                 return steadied(self.steps, cut)
         return selection

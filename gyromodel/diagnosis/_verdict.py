@@ -148,7 +148,7 @@ def judge(
             findings.append(
                 "Sizes of names beside it are fitted with what has no name as noise, as their uncertainties say."
             )
-        return judged("unknown", causes, {driver: 1.0}, driver=driver, next_test=_test_of_driver(driver))
+        return judged("unknown", causes, {driver: 1.0}, driver=driver, next_test=test_of_driver(driver))
     if not saw_tooth and _outweighed(effects, selection, scanner.record.domain):
         # A name holds less of what is there than it leaves, in a form that it cannot have; or all of them do.
         driver, score = last.best(drivers=True)
@@ -232,7 +232,7 @@ def _outweighed(causes: Sequence[Cause], selection: Selection, domain: str) -> b
     return bool(causes and selection.remains != "outliers" and more > least)
 
 
-def _test_of_driver(driver: str) -> str:
+def test_of_driver(driver: str) -> str:
     """What to measure of an error that follows some columns and has no name."""
     bases, forms = zip(*(measured(c) for c in smooth_columns(driver)), strict=True)
     if bases == ("time",):
