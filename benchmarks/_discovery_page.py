@@ -17,6 +17,7 @@ from tests.truth import levels, study
 from tests.truth.campaigns import HOMES, MOTION, TESTABLE
 from tests.truth.laws import Told
 from tests.truth.noise import FAMILY
+from tests.truth.other_designs import OTHER_DESIGNS
 from tests.truth.verdicts import Score, allowed
 
 # In multiples of the minimal detectable size.
@@ -45,6 +46,7 @@ def write_page(output: Path, whole: list[Kept]) -> None:
     reached += levels.outside_levels(parts["effects 3, outside"])
     reached += levels.unknown_levels(uncatalogued) + levels.pair_levels(parts["pairs"] + parts["pairs, moving"])
     reached += levels.amplitude_levels(main_sizes) + levels.ambiguity_levels(parts["inseparable"], parts["drifts"])
+    reached += levels.other_levels(parts["effects 3, other"] + parts["effects 10, other"])
     reached += levels.superfluous_levels(parts["nothing, superfluous"], parts["effects 10, superfluous"])
     reached += [levels.settled_level(parts["inseparable"]), levels.noise_level(nulls)]
     reached += [levels.adequacy_level(sized[3.0]), levels.claim_level(parts["forced"])]
@@ -389,7 +391,7 @@ def _never_hidden() -> list[str]:
     """Catalogue effects of a gyro that the study does not hide."""
     from gyromodel.declarations import declarations
 
-    hidden = {e for d in (*HOMES, *MOTION, "static_ramp") for e in TESTABLE[d]}
+    hidden = {e for d in (*HOMES, *MOTION, "static_ramp", *OTHER_DESIGNS) for e in TESTABLE[d]}
     return sorted({e for e, of in declarations().items() if of.domain == "gyro"} - hidden - {"bias_column"})
 
 

@@ -38,6 +38,7 @@ RESULTS = Path(__file__).parent / "results"
 # Campaigns at full scale, by what is hidden in them.
 NULLS, EFFECTS, CURVE, OUTER, UNKNOWNS, PAIRS = 400, 600, 200, 150, 300, 400
 SUPERFLUOUS = 150  # with nothing hidden, and with an effect
+OTHERS = 128  # of each size, of what few campaigns log
 MOVING = 48  # of unlisted errors, and of pairs, of gyros that are tumbled, turned and driven
 INSEPARABLE, CALIBRATED, MUTATED = 120, 200, 60
 # However small the part, so many of what is counted in few campaigns.
@@ -143,6 +144,8 @@ def _plan(seed: int, scale: float, controls: Sequence[str]) -> Iterator[tuple[st
     yield "drifts", study.drift_cases(few(INSEPARABLE), seed + 31), {}
     for label, size in (("nothing", 0.0), ("effects 10", 10.0)):
         yield f"{label}, superfluous", study.superfluous_cases(many(SUPERFLUOUS), seed + 45 + bool(size), size), {}
+    for size in (3.0, 10.0):
+        yield f"effects {size:g}, other", study.other_cases(many(OTHERS), seed + 47 + (size > 3.0), size), {}
     # With a safeguard off, and the same campaigns with it on.
     broken = study.null_cases(many(MUTATED), seed + 40, ("flicker_and_walk",), (A, B, C))
     whole = study.curve_cases(many(MUTATED), seed + 41, 3.0)

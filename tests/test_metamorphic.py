@@ -117,7 +117,7 @@ def without(safeguard: str, given: Campaign, *, hold_out: bool = False) -> Diagn
 @pytest.mark.long
 def test_each_safeguard_is_needed(first: Diagnosis):
     """Campaigns with nothing hidden, and `first`, whose answers go wrong with one safeguard off."""
-    nothing = campaign(0.0, 8)
+    nothing = campaign(0.0, 13)
     kept = diagnosed(nothing)
     assert kept.verdict == "adequate"
     assert without("no_whitening", nothing).verdict != "adequate"

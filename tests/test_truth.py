@@ -17,6 +17,8 @@ from tests.truth.designs import DESIGNS, RAMP_CODES
 from tests.truth.effects import EFFECTS, UNKNOWN, coil_temperature_rate, draw_shape, error
 from tests.truth.mde import FALSE_ALARMS, POWER, TESTED, amplitude, baseline, oracle, simpler, target
 from tests.truth.motion_designs import MOTION_DESIGNS
+from tests.truth.other_designs import OTHER_DESIGNS, TORQUED_RATE, beat
+from tests.truth.ring_laser import counted_rate, resting_case
 
 RARE = 1e-6  # chance that a right simulator fails one of some hundred statistical checks
 
@@ -236,13 +238,38 @@ def test_simple_effects_follow_their_equations(rng):
         assert error(name, a, 3.0, shape) == pytest.approx(3.0 * values, rel=1e-9, abs=1e-12), name
 
 
+def test_errors_that_few_campaigns_log_match_their_equations(rng):
+    slow, swept, torqued, laser, coil = (
+        OTHER_DESIGNS[n](rng) for n in ("slow_rates", "swept_rate", "torqued", "laser_monitors", "two_thermometers")
+    )
+    width, rate = np.deg2rad(0.5), slow.true["rate"]
+    still, step = resting_case(0.02, 6000)
+    beaten = np.sign(rate) * np.sqrt(np.maximum(rate**2 - width**2, 0.0))
+    assert rate + error("lock_in", slow, width, {}) == pytest.approx(beaten, abs=1e-6 * np.abs(rate).max())
+    counted = counted_rate(rate[:40], width, np.deg2rad(2 / 3600), step, still, rng)
+    assert counted == pytest.approx(beat(rate[:40], np.full(40, width)), abs=0.02 * width)
+    largest = np.abs(swept.true["rate"]).max()
+    told = swept.true["rate"] + error("saturation", swept, 0.2 * largest, {})
+    assert np.abs(told).max() == pytest.approx(0.8 * largest)
+    assert error("torquer_scale", torqued, 1e-3, {"mix": (1.0, 0.0, 0.0)}) == pytest.approx(
+        1e-3 * TORQUED_RATE * torqued.true["part"]
+    )
+    assert error("bias_backscatter", laser, 1e-7, {}) == pytest.approx(-1e-7 * laser.true["power"], rel=1e-3, abs=1e-12)
+    shift = error("bias_null_shift", laser, 1e-6, {})
+    assert np.corrcoef(shift, laser.columns["null_shift"])[0, 1] > 0.99
+    # A coil follows its case by a third of its diffusion time.
+    difference = error("bias_temperature_gradient", coil, 1.0, {})
+    behind = np.polyfit(coil.true["temperature_coil_rate"], difference, 1)[0]
+    assert 300 / 3 * 0.9 < behind < 700 / 3 * 1.1
+
+
 def _every_hidden() -> list[tuple[str, str]]:
     return [(d, e) for table in (TESTABLE, UNCATALOGUED) for d, names in table.items() for e in names]
 
 
 @pytest.mark.parametrize(("name", "effect"), _every_hidden())
 def test_hidden_effects_have_the_size_asked_for(name, effect, rng):
-    design = (DESIGNS | MOTION_DESIGNS)[name](rng)
+    design = (DESIGNS | MOTION_DESIGNS | OTHER_DESIGNS)[name](rng)
     law = noise.draw("flicker", design, rng)
     columns, units, metadata, truth = hide(effect, design, law, 3.0, rng)
     judge = oracle(design, law, baseline(design, effect) + simpler(effect))

@@ -12,8 +12,8 @@ from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._exchange import unresolved
 from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, is_noise
 from gyromodel.diagnosis._scan import Scanner
-from gyromodel.diagnosis._selection import FURTHER, MAXIMUM_ROUNDS, Selection, significant_driver
-from gyromodel.diagnosis._steps import BETWEEN, Found, Steps, standing
+from gyromodel.diagnosis._selection import MAXIMUM_ROUNDS, Selection, significant_driver
+from gyromodel.diagnosis._steps import BETWEEN, FURTHER, Found, Steps, standing
 
 # Columns of a driver's functions that are taken out beside names, as a part of the samples.
 MOST_TAKEN = 0.25

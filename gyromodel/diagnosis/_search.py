@@ -17,7 +17,7 @@ from gyromodel.diagnosis._forms import MAXIMUM_LINES
 from gyromodel.diagnosis._lines import lines_of
 from gyromodel.diagnosis._pairs import best_pair
 from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, evidence_in, rank, skipped
-from gyromodel.diagnosis._selection import FURTHER, MAXIMUM_ROUNDS, Selection, significant_driver
+from gyromodel.diagnosis._selection import MAXIMUM_ROUNDS, Selection, significant_driver
 from gyromodel.diagnosis._steps import BETWEEN, EXCHANGE, Found, Steps, rows_of, standing
 from gyromodel.estimate import Estimate
 
@@ -58,7 +58,7 @@ def _rounds(steps: Steps, progress: Progress, avoid: str = "") -> Selection:
         for more in (f.name for f in path if f.grows and f.name not in lost):
             if ranking.statistic.get(more, -np.inf) > score - DOUBT:
                 name, score = more, ranking.statistic[more]
-        shows = name is not None and _significant(steps, ranking, name, score - FURTHER * bool(path))
+        shows = name is not None and _significant(steps, ranking, name, score - steps.further(path, name))
         if not shows or not path:
             # Alone none may show, or what shows may stand for two.
             both = _together(steps, path, estimate, ranking, name if shows else None, barred)

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from gyromodel.diagnosis._ranking import Ranking
-from gyromodel.diagnosis._steps import Found
+from gyromodel.diagnosis._steps import FURTHER, Found
 from gyromodel.estimate import Estimate
 
 MAXIMUM_ROUNDS = 12
-# Nats that a further cause needs more than the first: of something wrong one cause is likelier than two.
-FURTHER = 2.0
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,9 @@ BY_FIT = 20.0
 ENTANGLED = 300.0
 # Part of its evidence (nats) by which a fit must gain with a candidate: what was searched may be no form it can have.
 KEPT = 0.5
+# Nats that a further cause needs more than the first, of something wrong one cause being likelier than two; and one
+# that every gyro has.
+FURTHER, COMMON = 2.0, 1.0
 # By how many nats a candidate must beat another to take its place.
 EXCHANGE = 2.0
 
@@ -192,6 +195,11 @@ class Steps:
     def least(self, ranking: Ranking, name: str) -> float:
         """The evidence (ln B) that a candidate of a ranking needs."""
         return self.threshold + ranking.more_needed(name)
+
+    def further(self, found: Sequence[Found], name: str) -> float:
+        """The evidence (nats) that a candidate needs besides, beside what was found."""
+        common = self.scanner.bank.price(name) < 0.0
+        return (COMMON if common else FURTHER) if found else 0.0
 
     def step(self, found: Sequence[Found], estimate: Estimate, ranking: Ranking, name: str) -> Found:
         """A candidate of a ranking beside what was found, as one more step; of much evidence, in what fits best.

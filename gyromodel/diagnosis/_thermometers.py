@@ -11,7 +11,7 @@ from gyromodel._checks import listed, thermometers
 from gyromodel.declarations import measured as base_of
 from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._ranking import is_driver, is_noise
-from gyromodel.diagnosis._selection import FURTHER, Selection
+from gyromodel.diagnosis._selection import Selection
 from gyromodel.diagnosis._steps import Found, Steps, quality, rows_of
 from gyromodel.estimate import Estimate, filter_of, whiten_columns
 from gyromodel.signals import Record, thermometer_rate, with_smooth_thermometers
@@ -80,7 +80,7 @@ def _only(steps: Steps, selection: Selection, kept: list[Found], left: float) ->
     path, estimates = list[Found](), [steps.baseline]
     for step in kept:
         ranking = steps.rank(estimates[-1], path)
-        least = steps.least(ranking, step.name) + step.more + FURTHER * bool(path)
+        least = steps.least(ranking, step.name) + step.more + steps.further(path, step.name)
         if not step.points and ranking.statistic.get(step.name, -np.inf) < least:
             continue
         path.append(replace(step, ranking=ranking, paired=False))

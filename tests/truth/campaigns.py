@@ -12,6 +12,7 @@ from .effects import EFFECTS, UNKNOWN, draw_shape, error
 from .mde import amplitude, baseline, parts
 from .motion import LAGS
 from .noise import Noise
+from .other_designs import OTHER_BRACKETS
 
 Array = np.ndarray
 
@@ -37,6 +38,13 @@ TESTABLE: dict[str, tuple[str, ...]] = {  # catalogue effects that each design c
                       "bandwidth", "scale_factor", "bias_temperature"),
     "one_axis_tumble": ("misalignment", "bias_acceleration_input", "bias_acceleration_spin"),
     "one_field": ("table_tilt", "bias_magnetic", "table_harmonic"),
+    "two_thermometers": ("bias_temperature_gradient", "bias_temperature_gradient_rate", *_THERMAL,
+                         "bias_temperature_rate"),
+    "laser_monitors": ("bias_backscatter", "bias_null_shift", "bias_temperature", "bias_supply_voltage"),
+    "slow_rates": ("lock_in", "scale_factor", "scale_asymmetry", "rate_hysteresis", "bias"),
+    "many_rates": ("scale_spline", *_SCALE, "rate_hysteresis"),
+    "swept_rate": ("saturation", *_SCALE, "rate_hysteresis"),
+    "torqued": ("torquer_scale", "bias", "bias_temperature"),
 }  # fmt: skip
 HOMES = (A, B, C, RUNS, LOOP)  # designs whose effects the study hides in turn
 MOTION = ("tumble", "turntable", "dynamic_rates")
@@ -106,8 +114,8 @@ def hide(
     for part in parts(effect)[::-1]:
         shape = draw_shape(part, design, rng)
         size = float(rng.choice([-1, 1])) * amplitude(part, design, noise, shape, times_mde)
-        if part in ("scale_sagnac_sine", *LAGS):
-            size = abs(size)  # a phase has no second sign, nor has a lag
+        if part in ("scale_sagnac_sine", *LAGS, *OTHER_BRACKETS):
+            size = abs(size)  # a phase has no second sign, nor has a lag, or a width
         errors.insert(0, error(part, design, size, shape))
     wrong = sum(errors, np.zeros(len(design.index)))
     drawn = noise.sample(design, rng)

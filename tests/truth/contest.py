@@ -19,6 +19,7 @@ from .effects import error
 from .mde import Oracle, baseline
 from .memory import friction
 from .motion import BASIS, SMALL
+from .other_designs import OTHER_BASIS, OTHER_SMALL
 
 # Share of the posterior and evidence (nats) of a name that is firm.
 FIRM, NEEDED = 0.95, 4.0
@@ -37,15 +38,22 @@ def _signals(name: str, design: Design) -> Array:
     time = design.true["time"]
     span = np.ptp(time)
     shapes: list[dict[str, object]] = [{}]
-    if name in BASIS:
-        size = SMALL.get(name, 1.0)
-        return np.stack([error(name, design, size, shape) for shape in BASIS[name]], axis=-1)[:, None]
+    small, basis = SMALL | OTHER_SMALL, BASIS | OTHER_BASIS
+    if name in basis:
+        size = small.get(name, 1.0)
+        return np.stack([error(name, design, size, shape) for shape in basis[name]], axis=-1)[:, None]
     match name:
         case "scale_nonlinearity":
             return np.stack([error(name, design, 1.0, {"mix": row}) for row in np.eye(4)], axis=-1)[:, None]
         case "time_delay" | "bandwidth":
             sizes = design.step * np.geomspace(0.03, 5.0, 12)
             return np.stack([error(name, design, size, {}) / size for size in sizes], axis=1)[:, :, None]
+        case "lock_in" | "saturation":
+            sizes = np.abs(design.true["rate"]).max() * np.geomspace(1e-3, 0.3, 16)
+            return np.stack([error(name, design, size, {}) for size in sizes], axis=1)[:, :, None]
+        case "scale_spline":
+            x = design.true["rate"] / np.abs(design.true["rate"]).max()
+            return np.exp(-0.5 * ((x[:, None] - np.linspace(-1, 1, 9)) / 0.25) ** 2)[:, None]
         case "bias_periodic":
             angle = 2 * np.pi * np.outer(time, np.arange(4 / span, 0.22 / design.step, 1 / (4 * span)))
             return np.stack([np.sin(angle), np.cos(angle)], axis=-1)
@@ -67,7 +75,7 @@ def _signals(name: str, design: Design) -> Array:
             shapes = [{"tau": tau * span} for tau in np.geomspace(0.04, 0.3, 12)]
         case "bias_step":
             shapes = [{"at": at} for at in 0.5 * (time[1:] + time[:-1])[len(time) // 12 : -(len(time) // 12)]]
-    size = 0.3 / np.abs(design.true["rate"]).max() if name == "scale_sagnac_sine" else SMALL.get(name, 1.0)
+    size = 0.3 / np.abs(design.true["rate"]).max() if name == "scale_sagnac_sine" else small.get(name, 1.0)
     return np.stack([error(name, design, size, shape) for shape in shapes], axis=1)[:, :, None]
 
 

@@ -16,16 +16,17 @@ from .memory import (
     bias_readout_code,
     bias_thermal_hysteresis,
     bias_turn_on,
+    coil_temperature_rate,
     draw_hysteresis,
     draw_table,
     rate_hysteresis,
     scale_drift,
 )
 from .motion import MOTION_EFFECTS, MOTION_SHAPES
+from .other_designs import OTHER_EFFECTS, OTHER_SHAPES
 
 Array = np.ndarray
 Effect = Callable[..., Array]
-LAYERS = 24  # of the coil in the heat-diffusion model
 
 
 # Scale: error = scale error times rate.
@@ -89,26 +90,6 @@ def bias_temperature(design: Design, amplitude: float) -> Array:
 def bias_temperature_curve(design: Design, amplitude: float, kind: str, at: float) -> Array:
     """Bias curved in temperature."""
     return amplitude * _curve(design.true["temperature"], kind, at)
-
-
-def coil_temperature_rate(time: Array, surface: Array, tau: float) -> Array:
-    """Rate of the coil's mean temperature, heat diffusing in from one face (implicit Euler).
-
-    A slab of LAYERS cells, the other face insulated, diffusion time tau = thickness^2 / diffusivity. On a steady
-    ramp the mean lags the face by tau/3, so the rate tends to that of the face.
-    """
-    dt = time[1] - time[0]
-    k = dt / tau * LAYERS**2
-    diffusion = np.diag(np.full(LAYERS, 2.0)) - np.eye(LAYERS, k=1) - np.eye(LAYERS, k=-1)
-    diffusion[0, 0], diffusion[-1, -1] = 3.0, 1.0  # the face is half a cell away; nothing crosses the other side
-    advance = np.linalg.inv(np.eye(LAYERS) + k * diffusion)
-    layers = np.full(LAYERS, surface[0])
-    mean = np.full_like(surface, surface[0])
-    for i in range(1, len(surface)):
-        layers[0] += 2 * k * surface[i]
-        layers = advance @ layers
-        mean[i] = layers.mean()
-    return np.gradient(mean, dt)
 
 
 def bias_temperature_rate(design: Design, amplitude: float, tau: float) -> Array:
@@ -212,7 +193,8 @@ EFFECTS: dict[str, Effect] = {
         bias_drift, bias_step, bias_warmup, bias_periodic, bias_temperature_product, bias_thermal_hysteresis,
         rate_hysteresis, bias_turn_on, scale_drift, bias_readout_code,
     )
-} | {f"bias_{c}": _linear(c) for c in ("supply_voltage", "pressure", "laser_current")} | MOTION_EFFECTS  # fmt: skip
+} | {f"bias_{c}": _linear(c) for c in ("supply_voltage", "pressure", "laser_current")}  # fmt: skip
+EFFECTS |= MOTION_EFFECTS | OTHER_EFFECTS
 
 RIPPLING = ("temperature", "rate", "supply_voltage", "acceleration_spin", "vibration")
 UNKNOWN: dict[str, tuple[Effect, tuple[str, ...]]] = {  # effect and the columns it follows
@@ -245,33 +227,37 @@ def _draw_ripple(design: Design, rng: np.random.Generator) -> dict[str, Any]:
     return {"cycles": rng.uniform(3.0, 5.5), "phase": rng.uniform(0, 2 * np.pi)}
 
 
-SHAPES: dict[str, Callable[[Design, np.random.Generator], dict[str, Any]]] = {
-    "scale_nonlinearity": _draw_mix,
-    "scale_temperature_curve": _draw_curve,
-    "bias_temperature_curve": _draw_curve,
-    "bias_temperature_rate": lambda design, rng: {"tau": rng.uniform(1.0, 4.0) * design.step},
-    "bias_temperature_product": lambda design, rng: {"tau": rng.uniform(1.0, 4.0) * design.step},
-    "bias_thermal_hysteresis": lambda design, rng: draw_hysteresis(design.true["temperature"], rng),
-    "rate_hysteresis": lambda design, rng: draw_hysteresis(design.true["rate"], rng),
-    "bias_turn_on": lambda design, rng: {"offsets": rng.standard_normal(len(np.unique(design.true["run"])))},
-    "bias_readout_code": lambda design, rng: draw_table(rng),
-    "bias_step": lambda design, rng: {"at": rng.uniform(*np.quantile(design.true["time"], [0.1, 0.9]))},
-    "bias_warmup": lambda design, rng: {"tau": rng.uniform(0.05, 0.25) * design.true["time"][-1]},
-    "bias_periodic": _draw_line,
-    **{f"{c}_ripple": _draw_ripple for c in RIPPLING},
-    "temperature_rate_switch": lambda design, rng: {"width": rng.uniform(0.05, 0.15)},
-    "buried_temperature_ripple": lambda design, rng: {
-        "cycles": rng.uniform(2.0, 3.0),
-        "phase": rng.uniform(0, 2 * np.pi),
-        "lag": rng.uniform(0.02, 0.06),
-    },
-    "pressure_bump": lambda design, rng: {"at": rng.uniform(0.3, 0.7), "width": rng.uniform(0.06, 0.12)},
-    "pressure_switch": lambda design, rng: {"at": rng.uniform(0.2, 0.4), "width": rng.uniform(0.02, 0.05)},
-    "rate_temperature_bump": lambda design, rng: {
-        "at": (rng.uniform(0.25, 0.75), rng.uniform(0.25, 0.75)),
-        "width": rng.uniform(0.12, 0.2),
-    },
-} | MOTION_SHAPES
+SHAPES: dict[str, Callable[[Design, np.random.Generator], dict[str, Any]]] = (
+    {
+        "scale_nonlinearity": _draw_mix,
+        "scale_temperature_curve": _draw_curve,
+        "bias_temperature_curve": _draw_curve,
+        "bias_temperature_rate": lambda design, rng: {"tau": rng.uniform(1.0, 4.0) * design.step},
+        "bias_temperature_product": lambda design, rng: {"tau": rng.uniform(1.0, 4.0) * design.step},
+        "bias_thermal_hysteresis": lambda design, rng: draw_hysteresis(design.true["temperature"], rng),
+        "rate_hysteresis": lambda design, rng: draw_hysteresis(design.true["rate"], rng),
+        "bias_turn_on": lambda design, rng: {"offsets": rng.standard_normal(len(np.unique(design.true["run"])))},
+        "bias_readout_code": lambda design, rng: draw_table(rng),
+        "bias_step": lambda design, rng: {"at": rng.uniform(*np.quantile(design.true["time"], [0.1, 0.9]))},
+        "bias_warmup": lambda design, rng: {"tau": rng.uniform(0.05, 0.25) * design.true["time"][-1]},
+        "bias_periodic": _draw_line,
+        **{f"{c}_ripple": _draw_ripple for c in RIPPLING},
+        "temperature_rate_switch": lambda design, rng: {"width": rng.uniform(0.05, 0.15)},
+        "buried_temperature_ripple": lambda design, rng: {
+            "cycles": rng.uniform(2.0, 3.0),
+            "phase": rng.uniform(0, 2 * np.pi),
+            "lag": rng.uniform(0.02, 0.06),
+        },
+        "pressure_bump": lambda design, rng: {"at": rng.uniform(0.3, 0.7), "width": rng.uniform(0.06, 0.12)},
+        "pressure_switch": lambda design, rng: {"at": rng.uniform(0.2, 0.4), "width": rng.uniform(0.02, 0.05)},
+        "rate_temperature_bump": lambda design, rng: {
+            "at": (rng.uniform(0.25, 0.75), rng.uniform(0.25, 0.75)),
+            "width": rng.uniform(0.12, 0.2),
+        },
+    }
+    | MOTION_SHAPES
+    | OTHER_SHAPES
+)
 
 
 def draw_shape(name: str, design: Design, rng: np.random.Generator) -> dict[str, Any]:

@@ -213,6 +213,22 @@ def outside_levels(records: list[Record]) -> list[Level]:
     ]  # fmt: skip
 
 
+def other_levels(records: list[Record]) -> list[Level]:
+    """Rows 5, 5+, 6 and 9 of effects that show in what few campaigns log, by size."""
+    levels, of = [], "of what few campaigns log"
+    for size in sorted({r.case.times_mde for r in records}):
+        group = [r for r in records if r.case.times_mde == size]
+        scores = _scores(group)
+        named = [s.named for s in _scores(alone(group))]
+        levels += [
+            _level("5", f"detected and named, isolable, {of}, {size:g}×", "–", _ROW5[size], True, named),
+            _level("5+", f"right verdict, {of}, {size:g}×", "–", 0.92, True, [s.right for s in scores]),
+            _level("6", f"firm and wrong, {of}, {size:g}×", "–", 0.01, False, [s.firm_and_wrong for s in scores]),
+            _level("9", f"called unknown, {of}, {size:g}×", "–", 0.02, False, [s.called_unknown for s in scores]),
+        ]
+    return levels
+
+
 def superfluous_levels(nothing: list[Record], hidden: list[Record]) -> list[Level]:
     """Rows 1, 5+ and 6 where the simulation has effects that the gyro has not; a refusal is not a right answer."""
     beside = "one to four effects simulated that are not there"

@@ -20,6 +20,7 @@ from .designs import Design
 from .effects import UNKNOWN, error
 from .motion import BRACKETS, SMALL
 from .noise import Noise
+from .other_designs import OTHER_BRACKETS, OTHER_SMALL
 
 Array = np.ndarray
 FALSE_ALARMS, POWER = 0.01 / 20, 0.8
@@ -41,6 +42,10 @@ TESTED = dict.fromkeys(UNKNOWN, (1, 100)) | {
     "table_harmonic": (2, 4),
     "time_delay": (1, 2),
     "bandwidth": (1, 2),
+    "scale_spline": (8, 2),
+    "saturation": (1, 5),
+    "lock_in": (1, 3),
+    "torquer_scale": (3, 1),
 }
 
 
@@ -99,7 +104,7 @@ def amplitude(effect: str, design: Design, noise: Noise, shape: dict[str, Any], 
     """Amplitude that puts an effect at `times_mde` times its minimal detectable size, or as near as it can be."""
     judge = oracle(design, noise, baseline(design, effect) + simpler(effect))
     wanted = times_mde * target(effect)
-    brackets = BRACKETS
+    brackets = BRACKETS | OTHER_BRACKETS
     if effect == "scale_sagnac_sine":
         full = np.abs(design.true["rate"]).max()
         brackets = {effect: (1e-4 / full, 1.5 / full)}
@@ -112,5 +117,5 @@ def amplitude(effect: str, design: Design, noise: Noise, shape: dict[str, Any], 
         if excess(high) < 0:
             return float(np.exp(high))  # as large as it can be
         return float(np.exp(root_scalar(excess, bracket=(low, high)).root))
-    small = SMALL.get(effect, 1.0)
+    small = (SMALL | OTHER_SMALL).get(effect, 1.0)
     return wanted * small / judge.norm(error(effect, design, small, shape))

@@ -1,7 +1,8 @@
 """Errors that remember, belong to a power cycle or sit in the readout, from parts that do each of it.
 
 Hysteresis is a sum of relays (Preisach), of friction elements whose yields scatter; a late thermometer is a node of a
-thermal network; a converter clips and rounds; a ramp converter has a table of one error a code.
+thermal network, and a coil one of many layers; a converter clips and rounds; a ramp converter has a table of one error
+a code.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from .designs import RAMP_CODES, Design
 
 Array = np.ndarray
 RELAYS = 400  # across the range of the driver, for each element
+LAYERS = 24  # of the coil in the heat-diffusion model
 YIELDS = (0.85, 0.95, 1.05, 1.15)  # of the friction elements, over the mean
 
 
@@ -68,6 +70,26 @@ def scale_drift(design: Design, amplitude: float) -> Array:
 def bias_readout_code(design: Design, amplitude: float, table: Array) -> Array:
     """The ramp converter's error at each code, turned into a rate by the loop."""
     return amplitude * table[design.true["feedback_ramp"].astype(int)]
+
+
+def coil_temperature_rate(time: Array, surface: Array, tau: float) -> Array:
+    """Rate of the coil's mean temperature, heat diffusing in from one face (implicit Euler).
+
+    A slab of LAYERS cells, the other face insulated, diffusion time tau = thickness^2 / diffusivity. On a steady
+    ramp the mean lags the face by tau/3, so the rate tends to that of the face.
+    """
+    dt = time[1] - time[0]
+    k = dt / tau * LAYERS**2
+    diffusion = np.diag(np.full(LAYERS, 2.0)) - np.eye(LAYERS, k=1) - np.eye(LAYERS, k=-1)
+    diffusion[0, 0], diffusion[-1, -1] = 3.0, 1.0  # the face is half a cell away; nothing crosses the other side
+    advance = np.linalg.inv(np.eye(LAYERS) + k * diffusion)
+    layers = np.full(LAYERS, surface[0])
+    mean = np.full_like(surface, surface[0])
+    for i in range(1, len(surface)):
+        layers[0] += 2 * k * surface[i]
+        layers = advance @ layers
+        mean[i] = layers.mean()
+    return np.gradient(mean, dt)
 
 
 def late(time: Array, node: Array, tau: float) -> Array:

@@ -25,6 +25,7 @@ from .motion import MOTION_EFFECTS
 from .motion_designs import MOTION_DESIGNS
 from .mutants import mutated
 from .noise import FAMILY, Noise, draw
+from .other_designs import OTHER_DESIGNS, OTHER_EFFECTS
 from .verdicts import Answer, Score, judge
 
 Array = np.ndarray
@@ -87,7 +88,7 @@ class Record:
 def build(case: Case, noise_of: NoiseOf | None = None) -> Built:
     """Simulate a case, its noise drawn by kind, or that of its design by `noise_of`."""
     rng = np.random.default_rng(case.seed)
-    design = (DESIGNS | MOTION_DESIGNS)[case.design](rng)
+    design = (DESIGNS | MOTION_DESIGNS | OTHER_DESIGNS)[case.design](rng)
     noise = noise_of(case.noise, design) if noise_of else draw(case.noise, design, rng)
     hidden = hide(case.effect, design, noise, case.times_mde, rng)
     return Built(*hidden, design, noise, case.seed, (*hidden[-1].baseline, *case.superfluous))
@@ -345,6 +346,12 @@ def motion_cases(count: int, seed: int, times_mde: float, noises: Iterable[str] 
     order = cycle(np.random.default_rng(seed).permutation(len(cells)))
     chosen = [cells[next(order)] for _ in range(count)]
     return [Case(s, d, n, e, times_mde) for s, (d, e, n) in zip(_seeds(seed, count), chosen, strict=True)]
+
+
+def other_cases(count: int, seed: int, times_mde: float) -> list[Case]:
+    """Effects of what few campaigns log, each in its designs and noises, in an order of the seed."""
+    cells = [(d, n, e) for d in OTHER_DESIGNS for n in FAMILY for e in TESTABLE[d] if e in OTHER_EFFECTS]
+    return _in_order(cells, count, seed, times_mde)
 
 
 def _in_turn(
