@@ -25,6 +25,7 @@ SIZES = (0.5, 1.0, 2.0, 3.0, 10.0)
 # Channels that a campaign measures, of those that unknown effects follow.
 MEASURED = ("temperature", "rate", "supply_voltage", "pressure")
 WALK = "noise_random_walk"
+SOME = 3  # one in so many of the effects of the detectable size is shown to an oracle
 # Row 18: processor seconds that must do, and seconds that are wished for.
 MUST_SECONDS, GOAL_SECONDS = 60.0, 10.0
 TIMED_DRAWS = 2000  # of the calibration of a diagnosis that is timed
@@ -299,19 +300,27 @@ def _beside_names(records: list[study.Record]) -> list[str]:
 
 
 def asked(label: str, records: list[study.Record]) -> list[study.Record]:
-    """The campaigns of a part that the oracle is asked about: of effects those that the engine has not told right."""
+    """The campaigns of a part that the oracle is asked about: of effects those that the engine has not told right.
+
+    At the detectable size those called unknown, and a part of all that it could name.
+    """
     scored = [(r, s) for r in records if (s := r.score)]
     if label.startswith("unknown 10"):
         return [r for r, score in scored if not score.called_unknown]
     if label.startswith("effects 10"):
         return [r for r in levels.alone(records) if r.score and not r.score.named]
     if label.startswith("effects 1"):
-        return [r for r, score in scored if score.called_unknown]
+        return [r for r, score in scored if score.called_unknown or _shown(r)]
     return records
 
 
+def _shown(record: study.Record) -> bool:
+    """Whether a campaign of row 5 is one of those that an oracle is shown at the detectable size."""
+    return bool(levels.alone([record])) and record.case.seed % SOME == 0
+
+
 def _bounds(parts: dict[str, list[study.Record]], told: dict[str, list[Told]]) -> list[str]:
-    """Rows 1, 2, 8, 12 and 14 of an oracle that knows how levels are drawn, as sure as the engine, on the same data."""
+    """Rows of an oracle that knows how levels are drawn, as sure as the engine, on the same data."""
     both = {label: list(zip(asked(label, parts[label]), told[label], strict=True)) for label in told if told[label]}
     nulls = both.get("nothing", []) + both.get("nothing, moving", [])
     counted = {("1", "something said, nothing hidden, noise of the family"): [bool(t.said) for _, t in nulls]}
@@ -321,11 +330,16 @@ def _bounds(parts: dict[str, list[study.Record]], told: dict[str, list[Told]]) -
     if "unknown 10" in both:
         missed = both["unknown 10"] + both.get("unknown 10, moving", [])
         counted["8", "flagged of those not flagged here, 10×, told the column but not its function"] = _ahead(missed)
-    mistaken = both.get("effects 1", []) + both.get("effects 1, white", [])
+    asked_all = both.get("effects 1", []) + both.get("effects 1, white", [])
+    mistaken = [(r, t) for r, t in asked_all if r.score and r.score.called_unknown]
     counted["9", "flagged of those called unknown here, 1×, told the column that was named"] = _ahead(mistaken)
     not_named = both.get("effects 10", []) + both.get("effects 10, white", [])
     more = [bool(t.said) for _, t in not_named]
     counted["5", "something said besides of those not named here, 10×, told the hidden effect but not its size"] = more
+    shown = [(r, t) for r, t in asked_all if _shown(r)]
+    here = 100 * np.mean([bool(r.score and r.score.named) for r, _ in shown]) if shown else 0.0
+    named = [levels.told_right(r, t.said) for r, t in shown]
+    counted["5", f"detected and named, 1×, where {here:.0f} % are named here"] = named
     inseparable = [len(t.said) > 1 and r.case.effect in t.said for r, t in both.get("inseparable", [])]
     counted["12", "ambiguous with the truth"] = inseparable
     counted["14", "noise class"] = [max(t.kinds, key=t.kinds.__getitem__) == r.case.noise for r, t in nulls]

@@ -71,6 +71,9 @@ def _signals(name: str, design: Design) -> Array:
             return np.stack([error(name, design, 1.0, {"offsets": row}) for row in runs], axis=-1)[:, None]
         case "bias_temperature_rate" | "bias_temperature_product":
             shapes = [{"tau": 2.5 * design.step}]
+            if "temperature_coil" in design.true:
+                # What a case and its coil differ by is the rate of a place deep in it.
+                shapes = [{"tau": tau * design.step} for tau in np.geomspace(1.0, 60.0, 9)]
         case "bias_warmup":
             shapes = [{"tau": tau * span} for tau in np.geomspace(0.04, 0.3, 12)]
         case "bias_step":

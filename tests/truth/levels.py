@@ -132,6 +132,11 @@ def oracle_right(record: Record) -> bool:
     return record.oracle_first in allowed(str(record.case.effect), record.case.design)[0]
 
 
+def told_right(record: Record, said: tuple[str, ...]) -> bool:
+    """Whether what was said of a campaign is one name, and right."""
+    return len(said) == 1 and said[0] in allowed(str(record.case.effect), record.case.design)[0]
+
+
 def oracle_names(records: list[Record]) -> tuple[int, int]:
     """What bounds row 5: campaigns where the oracle's name is right and firm, and of how many."""
     group = alone(records)
