@@ -30,9 +30,6 @@ ACCEPTED = (
     Accepted("bias_step", frozenset(), True, _SLOW),
     Accepted("bias_warmup", frozenset(), True, _SLOW),
     Accepted("scale_sagnac_sine", frozenset({"scale_nonlinearity"}), True, "a sine equals a cubic to third order"),
-    Accepted(
-        "scale_spline", frozenset({"scale_nonlinearity"}), True, "of few bends it equals a polynomial of fifth order"
-    ),
     Accepted("bias_temperature", frozenset(), True, "temperature is a line in time on one ramp", ("static_ramp",)),
     *(
         Accepted(
