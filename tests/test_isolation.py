@@ -83,6 +83,29 @@ def test_what_is_one_line_is_never_told_apart():
     assert "cannot be told" in beside.not_testable["bias_drift"]
 
 
+def test_a_second_thermometer_shows_what_lies_between_two():
+    """Taken to lag by a minute, here by an integrator: what is found of the difference is as least squares has it."""
+    i = np.arange(300)
+    temperature = 20 + 0.1 * np.abs(i % 100 - 50)
+    found = isolability(log(temperature), known_noise("bias"))
+    assert "bias_temperature_gradient" in found.not_testable
+    [(sentence, after)] = [test for test in found.tests if "second thermometer" in test[0]]
+    assert "60 s" in sentence
+    fine = np.arange(0, 300 * 20, 0.05)
+    held, second = np.interp(fine, i * STEP, temperature), np.empty(len(fine))
+    second[0] = temperature[0]
+    for k in range(1, len(fine)):
+        second[k] = second[k - 1] + (held[k - 1] - second[k - 1]) * 0.05 / 60.0
+    difference, one = np.interp(i * STEP, fine, second) - temperature, np.ones(300)
+    sine = left(difference, one, temperature) / left(difference, one)
+    size = after["bias_temperature_gradient", "bias_temperature"].value
+    assert taken(size * left(difference, one), np.sqrt(1.0 - sine**2), sine) == pytest.approx(0.05, rel=0.02)
+    pair = "bias_temperature", "bias_drift"
+    assert after[pair].value == pytest.approx(found.apart[pair].value, rel=1e-6)
+    twice = log(temperature).with_column("temperature_case", temperature + difference, "degC")
+    assert not [s for s, _ in isolability(twice, known_noise("bias")).tests if "second thermometer" in s]
+
+
 def test_the_noise_and_the_scale_factor_must_be_stated():
     with pytest.raises(ModelError, match="state noise_white"):
         isolability(log(np.arange(50.0)), model_from_effects(["bias"]))

@@ -24,6 +24,8 @@ EARTH, FAST = np.deg2rad(16.0 / 3600.0), np.deg2rad(10.0)
 FASTER, CYCLES = 4, 2
 # Levels of a column that is stepped up and down, and delays tried between two thermometers as parts of the record.
 LEVELS, DELAYS = 5, np.linspace(0.0, 0.1, 41)
+# A second thermometer that is not there yet: taken to lag by so much (s), at most by this part of the record.
+LATE, LATEST = 60.0, 0.05
 
 
 class AddedTest(NamedTuple):
@@ -58,6 +60,17 @@ def added_tests(campaign: Campaign) -> Iterator[AddedTest]:
         }
         stepped = still | {name: _staircase(campaign.columns[name], len(campaign))}
         yield AddedTest(f"Step {name} up and down between its extremes, all else held.", _with(campaign, **stepped))
+
+
+def second_thermometer(campaign: Campaign) -> Iterator[AddedTest]:
+    """The campaign itself with a second column of temperature, where it has one; what that will read is a guess."""
+    if thermometers(campaign.columns) != ["temperature"] or not np.ptp(campaign.columns["temperature"]) > 0:
+        return
+    time = campaign.si("time")
+    late = min(LATE, LATEST * float(np.ptp(time)))
+    reading = _lagging(time, campaign.columns["temperature"], late)
+    sentence = f"Log a second thermometer, at the coil or the case, here taken to lag by {late:.3g} s."
+    yield AddedTest(sentence, campaign.with_column("temperature_second", reading, campaign.units["temperature"]))
 
 
 def _at_rest(campaign: Campaign) -> bool:
@@ -150,8 +163,9 @@ def _delayed(time: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
 
 
 def _lagging(time: np.ndarray, values: np.ndarray, constant: float) -> np.ndarray:
-    """What follows with a time constant, at rest before."""
+    """What follows with a time constant, at rest before; straight between samples."""
     even, step = np.linspace(time[0], time[-1], len(time), retstep=True)
     kept = np.exp(-step / constant) if constant else 0.0
+    late = (1.0 - kept) * constant / step
     x = np.interp(even, time, values)
-    return np.interp(time, even, lfilter([1.0 - kept], [1.0, -kept], x, zi=[kept * x[0]])[0])
+    return np.interp(time, even, lfilter([1.0 - late, late - kept], [1.0, -kept], x, zi=[late * x[0]])[0])

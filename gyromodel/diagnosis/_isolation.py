@@ -15,7 +15,7 @@ from scipy.stats import norm
 from gyromodel._model_units import parameter_unit
 from gyromodel._noise_level import with_stated_level
 from gyromodel.campaign import Campaign
-from gyromodel.diagnosis._added_tests import added_tests
+from gyromodel.diagnosis._added_tests import added_tests, second_thermometer
 from gyromodel.diagnosis._bank import PART_OF, build_bank
 from gyromodel.diagnosis._evidence import explained_for, safe_threshold
 from gyromodel.diagnosis._forms import step_at
@@ -270,11 +270,16 @@ def isolability(campaign: Campaign, model: GyroModel, *, tests: bool = True) -> 
     now = _sizes([campaign], model)
     # Pairs that are not told apart at the size that shows them are what a further test is for.
     in_doubt = [(a, b) for (a, b), size in now.apart.items() if size.value > now.detectable[a].value]
+    runs = [([campaign, _output_known(t.campaign, 1)], t.sentence) for t in added_tests(campaign) if tests]
+    runs += [([t.campaign], t.sentence) for t in second_thermometer(campaign) if tests]
     helped = []
-    for test in added_tests(campaign) if tests else ():
-        after = _sizes([campaign, _output_known(test.campaign, 1)], model).apart
-        gained = sum(_nats(now.apart[pair], after[pair]) for pair in in_doubt if pair in after)
-        helped.append((gained, test.sentence, after))
+    for measured, sentence in runs:
+        after = _sizes(measured, model)
+        gained = sum(_nats(now.apart[pair], after.apart[pair]) for pair in in_doubt if pair in after.apart)
+        # What the campaign did not show would have had another's name.
+        closest = [after.closest(name) for name in after.detectable if name not in now.detectable]
+        gained += sum(_nats(Size(np.inf, rival[1].unit), rival[1]) for rival in closest if rival)
+        helped.append((gained, sentence, after.apart))
     helped.sort(key=lambda item: -item[0])
     return replace(now, tests=tuple((sentence, after) for _, sentence, after in helped))
 

@@ -27,11 +27,15 @@ def isolability_rows(found: Isolability) -> list[tuple[str, ...]]:
 def parted_words(found: Isolability, after: Mapping[tuple[str, str], Size]) -> str:
     """The effects that a test helps most to tell from all others, with the sizes before and after."""
     helped = []
-    for name in found.detectable:
+    for name in dict.fromkeys(effect for effect, _ in after):
         before, now = found.closest(name), found.closest(name, after)
-        if before and now and before[1].value > WORTHWHILE * now[1].value:
-            sizes = f"{_digits(now[1])} instead of {_digits(before[1])} {unit_text(now[1].unit)}".rstrip()
-            helped.append((now[1].value / before[1].value, f"{name} at {sizes}"))
+        if not now or not math.isfinite(now[1].value):
+            continue
+        at, unit = f"{name} at {_digits(now[1])}", unit_text(now[1].unit)
+        if name not in found.detectable:
+            helped.append((1.0, f"{at} {unit}".rstrip() + ", which the campaign does not show"))
+        elif before and before[1].value > WORTHWHILE * now[1].value:
+            helped.append((now[1].value / before[1].value, f"{at} instead of {_digits(before[1])} {unit}".rstrip()))
     said = [text for _, text in sorted(helped)[:TOLD]]
     return f"It tells from all others {'; '.join(said)}." if said else "It helps with single pairs only."
 
