@@ -186,6 +186,8 @@ def main(argv: list[str] | None = None) -> None:
             "scikit-learn is not installed: no other methods run beside (pip install gyromodel[peers])", file=sys.stderr
         )
     if not args.page:
+        # Every part has processes of its own.
+        keep_compiled()
         kept = Kept(args.kept / f"seed_{args.seed}.json.gz")
         before = kept.code.split(" and ") if kept.parts and args.go_on else []
         made = " and ".join(dict.fromkeys([*before, code()])), args.scale
