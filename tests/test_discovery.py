@@ -136,6 +136,23 @@ def test_what_more_there_may_be_beside_a_name_needs_more_than_the_first(case: st
 
 
 @pytest.mark.long
+@pytest.mark.parametrize(
+    "case",
+    [
+        # One curve, which is not zero in the middle, or any function of temperature, would stand for both.
+        study.Case(656346159207822, "rate_steps", "flicker_and_walk", "bias+bias_temperature", 3.0),
+        study.Case(779300188119558, "static_cycle", "random_walk", "bias+bias_temperature_curve", 3.0),
+        # Without the bias a hinge of the curve moves to where it stands for it, and hides it.
+        study.Case(200261490466448, "static_cycle", "flicker_and_walk", "bias+bias_temperature_curve", 3.0),
+    ],
+)
+def test_a_bias_that_no_simulation_has_is_found_beside_what_could_stand_for_it(case: study.Case):
+    [record] = study.run_cases([case])
+    assert record.answer.verdict == "named"
+    assert set(record.answer.causes) == set(case.effect.split("+"))
+
+
+@pytest.mark.long
 def test_simulated_effects_that_are_not_there_mislead_nobody(seed):
     records = [study.run_cases(study.superfluous_cases(SUPERFLUOUS, seed, size), WORKERS) for size in (0.0, 10.0)]
     _require(levels.superfluous_levels(*records), [*records[0], *records[1]], seed)

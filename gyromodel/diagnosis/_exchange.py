@@ -12,7 +12,7 @@ from gyromodel.diagnosis._forms import periodic
 from gyromodel.diagnosis._lines import lines_of, near
 from gyromodel.diagnosis._misfit import lines_of_noise, unsteady_lines
 from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, is_driver, is_noise
-from gyromodel.diagnosis._steps import BETWEEN, EXCHANGE, Found, Steps, standing
+from gyromodel.diagnosis._steps import BETWEEN, EXCHANGE, Found, Steps, quality, standing
 from gyromodel.effects.drivers import BiasPeriodic
 from gyromodel.estimate import Estimate
 
@@ -37,14 +37,24 @@ def exchanged(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[lis
             continue
         own = {i: r.statistic[found[i].name] for i, r in rankings.items() if found[i].name in r.statistic}
         needless = [i for i, v in own.items() if v < _least(steps, rankings[i], found[i].name)]
-        if not needless or len(found) < 2:
-            return found, estimate, rankings
-        least = min(needless, key=lambda i: own[i])
-        fewer = found[:least] + found[least + 1 :]
-        after = steps.fit(fewer)
-        if after is None:
+        for i in sorted(needless, key=lambda i: own[i]) if len(found) > 1 else ():
+            fewer = found[:i] + found[i + 1 :]
+            after = steps.fit(fewer)
+            if after is None:
+                return found, estimate, rankings
+            gain = _taken_over(found[i], estimate, after)
+            if gain < _least(steps, rankings[i], found[i].name):
+                break
+            rankings[i] = replace(rankings[i], statistic=rankings[i].statistic | {found[i].name: gain})
+        else:
             return found, estimate, rankings
         found, estimate = fewer, after
+
+
+def _taken_over(step: Found, estimate: Estimate, without: Estimate) -> float:
+    """What a fit gains with a step (nats) that the shapes of others may stand for without it, so that they hide it."""
+    hides = not step.rows and any(not slot.linear for slot in without.model.slots())
+    return quality(estimate) - quality(without) if hides else -np.inf
 
 
 def _one_for_two(

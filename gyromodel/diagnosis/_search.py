@@ -38,11 +38,30 @@ def search(steps: Steps, progress: Progress = None) -> Selection:
         steps: the data, the simulation and the threshold.
         progress: called with a line and the fraction done.
     """
-    return steadied(steps, beside_driver(steps, steadied(steps, _rounds(steps, progress))))
+    selection = _begun_with_common(steps, progress, _rounds(steps, progress))
+    return steadied(steps, beside_driver(steps, steadied(steps, selection)))
 
 
-def _rounds(steps: Steps, progress: Progress, avoid: str = "") -> Selection:
-    """Add candidates until nothing more is significant; `avoid` is not to be the first."""
+def _begun_with_common(steps: Steps, progress: Progress, selection: Selection) -> Selection:
+    """The search begun with what every gyro has, where the simulation lacks it and that explains all, and better.
+
+    A curve, or any function of a column, stands for a bias and something simpler at once.
+    """
+    bank, first, names = steps.scanner.bank, selection.first, {f.name for f in selection.found}
+    common = [name for name in bank.names() if bank.price(name) < 0.0 and name not in names]
+    for name in common if names or selection.driver else ():
+        if not first.statistic.get(name, -np.inf) >= steps.least(first, name):
+            continue
+        other = _rounds(steps, progress, begin=name)
+        if other.unfinished or all(f.name != name for f in other.found):
+            continue
+        if selection.driver or steps.fits_better(other.found, selection.found):
+            selection = other
+    return selection
+
+
+def _rounds(steps: Steps, progress: Progress, avoid: str = "", begin: str = "") -> Selection:
+    """Add candidates until nothing more is significant; `avoid` is not to be the first, and `begin` is."""
     scanner, threshold = steps.scanner, steps.threshold
     path: list[Found] = []
     lost: set[str] = set()
@@ -55,11 +74,13 @@ def _rounds(steps: Steps, progress: Progress, avoid: str = "") -> Selection:
         remains = "bias_periodic" if full and lines >= threshold else ""
         barred = ("bias_periodic" if full else "", "" if path else avoid, *lost)
         name, score = ranking.best(drivers=False, but=barred)
+        if begin and not path:
+            name, score = begin, ranking.statistic[begin]
         for more in (f.name for f in path if f.grows and f.name not in lost):
             if ranking.statistic.get(more, -np.inf) > score - DOUBT:
                 name, score = more, ranking.statistic[more]
         shows = name is not None and _significant(steps, ranking, name, score - steps.further(path, name))
-        if not shows or not path:
+        if not shows or not (path or begin):
             # Alone none may show, or what shows may stand for two.
             both = _together(steps, path, estimate, ranking, name if shows else None, barred)
             if both and len(path) + 2 <= MAXIMUM_ROUNDS and not any(unresolved(e, f, scanner.step) for f, e in both):

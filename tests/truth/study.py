@@ -288,7 +288,7 @@ def pair_cases(count: int, seed: int, times_mde: float, noises: Iterable[str] = 
         for d in (A, B, C)
         for n in noises
         for a, b in combinations([e for e in TESTABLE[d] if e not in SLOW], 2)
-        if b != f"{a}_curve"
+        if b != f"{a}_curve" and {a, b} != {"bias_temperature_rate", "bias_temperature_product"}
     ]
     order = np.random.default_rng(seed).permutation(len(cells))
     chosen = [cells[order[i % len(cells)]] for i in range(count)]
