@@ -131,7 +131,8 @@ class Steps:
             entangled = after
         if lost < len(attempts):
             return entangled
-        simulated = set(self.baseline.model.labels) - {f.effect.label for f in found if f.effect is not None}
+        # What was found may have taken the place of an effect of the simulation.
+        simulated = set(self.baseline.model.labels) & set(model.labels) - {f.effect.label for f in found if f.effect}
         after = beside_unseen(data, searched, simulated, **how)
         return None if after is None or _negative(after, found) else after
 
