@@ -152,6 +152,16 @@ def test_a_bias_that_no_simulation_has_is_found_beside_what_could_stand_for_it(c
     assert set(record.answer.causes) == set(case.effect.split("+"))
 
 
+def test_what_is_searched_may_replace_an_effect_of_the_simulation():
+    """A scale factor that is missing beside one over temperature: a curve would do as well, and the delay is unseen."""
+    beside = "misalignment", "bandwidth", "scale_temperature"
+    [record] = study.run_cases(
+        [study.Case(851662445088332, "dynamic_rates", "random_walk", "scale_factor", 10.0, beside)]
+    )
+    assert record.answer.verdict in ("named", "ambiguous")
+    assert record.answer.causes[0] == "scale_factor"
+
+
 @pytest.mark.long
 def test_simulated_effects_that_are_not_there_mislead_nobody(seed):
     records = [study.run_cases(study.superfluous_cases(SUPERFLUOUS, seed, size), WORKERS) for size in (0.0, 10.0)]
