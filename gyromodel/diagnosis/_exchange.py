@@ -53,7 +53,7 @@ def exchanged(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[lis
 
 def _taken_over(step: Found, estimate: Estimate, without: Estimate) -> float:
     """What a fit gains with a step (nats) that the shapes of others may stand for without it, so that they hide it."""
-    hides = not step.rows and any(not slot.linear for slot in without.model.slots())
+    hides = step.effect is not None and not step.rows and any(not slot.linear for slot in without.model.slots())
     return quality(estimate) - quality(without) if hides else -np.inf
 
 
