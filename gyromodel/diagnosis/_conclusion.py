@@ -18,6 +18,7 @@ from gyromodel.diagnosis._unseen import held_back
 from gyromodel.diagnosis._variance import noise_level, tails
 from gyromodel.diagnosis._verdict import FAINT, judge, test_of_driver
 from gyromodel.estimate import Estimate, with_reading
+from gyromodel.model import effect_class
 
 TURNED_ON = (
     "There seems to be a warm-up behind every gap, as if the gyro had been off: its time is counted from there. The "
@@ -148,6 +149,9 @@ def _in_doubt(found: Searched, judgement: Judgement, baseline: Estimate, extende
     if found.instead and "bias_warmup" in extended.model.labels:
         found.findings.append(TURNED_ON)
         judgement = undecided(judgement, "bias_warmup", found.instead, TELL_RUNS)
+    if found.selection.either:
+        name, rival = found.selection.either
+        judgement = undecided(judgement, name, rival, effect_class(rival).test)
     if (rival := found.selection.rival) and judgement.causes:
         judgement = undecided(judgement, judgement.causes[0].effect, rival, test_of_driver(rival))
     return judgement

@@ -18,7 +18,8 @@ class Selection:
     `left_out` holds rankings beside everything found except one, where the search has made them; `remains` names what
     was still significant and not added, `beside_it` is the fit with it where there is one, and `unresolved` says why if
     it is too small. `alone` is the ranking beside the simulation where the path begins beside a driver's function.
-    `rival` is a driver that explains more than the names do, but not by enough to take their place.
+    `rival` is a driver that explains more than the names do, but not by enough to take their place. `either` is a
+    name that was found and another, which it hardly leads with what was found beside it.
     """
 
     estimate: Estimate
@@ -33,6 +34,7 @@ class Selection:
     beside_it: Estimate | None = field(default=None, repr=False)
     alone: Ranking | None = field(default=None, repr=False)
     rival: str | None = None
+    either: tuple[str, str] | None = None
 
     @property
     def first(self) -> Ranking:

@@ -79,6 +79,7 @@ class Session:
                     beside_it=estimates[i],
                     alone=selection.alone,
                     rival=selection.rival,
+                    either=selection.either,
                 )
                 return steadied(self.steps, cut)
         return selection
