@@ -151,6 +151,15 @@ def test_a_bias_that_no_simulation_has_is_found_beside_what_could_stand_for_it(c
     assert set(record.answer.causes) == set(case.effect.split("+"))
 
 
+@pytest.mark.long
+def test_a_bias_and_a_slope_that_hardly_lead_one_curve_are_told_as_either():
+    case = study.Case(656346159207822, "rate_steps", "flicker_and_walk", "bias+bias_temperature", 3.0)
+    [record] = study.run_cases([case])
+    assert record.answer.verdict == "ambiguous"
+    assert set(record.answer.credible) == {"bias_temperature", "bias_temperature_curve"}
+    assert "bias" in record.answer.causes
+
+
 def test_what_is_searched_may_replace_an_effect_of_the_simulation():
     """A scale factor that is missing beside one over temperature: a curve would do as well, and the delay is unseen."""
     beside = "misalignment", "bandwidth", "scale_temperature"
