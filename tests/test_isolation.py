@@ -12,6 +12,7 @@ from scipy.stats import binomtest, norm
 import gyromodel
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis import isolability
+from gyromodel.diagnosis._added_tests import second_thermometer
 from gyromodel.model import GyroModel, ModelError, model_from_effects
 from tests.truth import study
 
@@ -84,7 +85,7 @@ def test_what_is_one_line_is_never_told_apart():
 
 
 def test_a_second_thermometer_shows_what_lies_between_two():
-    """Taken to lag by a minute, here by an integrator: what is found of the difference is as least squares has it."""
+    """It lags by a minute, here by an integrator; what its difference takes to be found is as least squares has it."""
     i = np.arange(300)
     temperature = 20 + 0.1 * np.abs(i % 100 - 50)
     found = isolability(log(temperature), known_noise("bias"))
@@ -97,9 +98,12 @@ def test_a_second_thermometer_shows_what_lies_between_two():
     for k in range(1, len(fine)):
         second[k] = second[k - 1] + (held[k - 1] - second[k - 1]) * 0.05 / 60.0
     difference, one = np.interp(i * STEP, fine, second) - temperature, np.ones(300)
-    sine = left(difference, one, temperature) / left(difference, one)
-    size = after["bias_temperature_gradient", "bias_temperature"].value
-    assert taken(size * left(difference, one), np.sqrt(1.0 - sine**2), sine) == pytest.approx(0.05, rel=0.02)
+    [logged] = second_thermometer(log(temperature))
+    assert logged.campaign.columns["temperature_second"] - temperature == pytest.approx(difference, abs=1e-3 * 0.3)
+    # Across the temperature the difference is told apart as soon as it is found.
+    needed = after["bias_temperature_gradient", "bias_temperature"].value * left(difference, one)
+    assert 4.0 < needed < 5.2
+    assert not any("second" in effect for pair in after for effect in pair)
     pair = "bias_temperature", "bias_drift"
     assert after[pair].value == pytest.approx(found.apart[pair].value, rel=1e-6)
     twice = log(temperature).with_column("temperature_case", temperature + difference, "degC")

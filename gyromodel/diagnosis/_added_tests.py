@@ -1,4 +1,4 @@
-"""Further measurements that a campaign could be followed by: the same campaign again with one thing done otherwise."""
+"""What could be done besides: a campaign again with one thing done otherwise, or with one more column."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LATE, LATEST = 60.0, 0.05
 
 
 class AddedTest(NamedTuple):
-    """What to do, as a sentence, and the campaign to come; its output is that of the campaign it follows."""
+    """What to do, as a sentence, and the campaign to come; its output is that of the campaign at hand."""
 
     sentence: str
     campaign: Campaign

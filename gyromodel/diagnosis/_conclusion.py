@@ -142,6 +142,9 @@ def _with_noise_stated(found: Searched, extended: Estimate) -> Estimate:
 
 def _in_doubt(found: Searched, judgement: Judgement, baseline: Estimate, extended: Estimate) -> Judgement:
     """The judgement with the test that would settle it, and what else may be true in the place of what was found."""
+    if found.selection.either:
+        name, rival = found.selection.either
+        judgement = undecided(judgement, name, rival, effect_class(rival).test)
     if judgement.verdict == "ambiguous":
         names = list(judgement.credible_set)
         test = settling_test(found.data.searched, baseline.model, extended, names)
@@ -149,9 +152,6 @@ def _in_doubt(found: Searched, judgement: Judgement, baseline: Estimate, extende
     if found.instead and "bias_warmup" in extended.model.labels:
         found.findings.append(TURNED_ON)
         judgement = undecided(judgement, "bias_warmup", found.instead, TELL_RUNS)
-    if found.selection.either:
-        name, rival = found.selection.either
-        judgement = undecided(judgement, name, rival, effect_class(rival).test)
     if (rival := found.selection.rival) and judgement.causes:
         judgement = undecided(judgement, judgement.causes[0].effect, rival, test_of_driver(rival))
     return judgement

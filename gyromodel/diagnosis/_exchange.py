@@ -42,19 +42,33 @@ def exchanged(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[lis
             after = steps.fit(fewer)
             if after is None:
                 return found, estimate, rankings
-            gain = _taken_over(found[i], estimate, after)
-            if gain < _least(steps, rankings[i], found[i].name):
+            hidden = _hidden(steps, found, i, estimate, after)
+            if hidden is None:
                 break
-            rankings[i] = replace(rankings[i], statistic=rankings[i].statistic | {found[i].name: gain})
+            rankings[i] = hidden
         else:
             return found, estimate, rankings
         found, estimate = fewer, after
 
 
-def _taken_over(step: Found, estimate: Estimate, without: Estimate) -> float:
-    """What a fit gains with a step (nats) that the shapes of others may stand for without it, so that they hide it."""
-    hides = step.effect is not None and not step.rows and any(not slot.linear for slot in without.model.slots())
-    return quality(estimate) - quality(without) if hides else -np.inf
+def _hidden(steps: Steps, found: list[Found], i: int, estimate: Estimate, without: Estimate) -> Ranking | None:
+    """All candidates beside the others as they are with item i, where these stand for it in the fit without.
+
+    None where they have not: it is needless.
+    """
+    step, others = found[i], [*found[:i], *found[i + 1 :]]
+    shapes = any(not slot.linear for slot in without.model.slots())
+    if step.effect is None or step.rows or not shapes or step.effect.label not in estimate.model.labels:
+        return None
+    beside = estimate.model.without(step.effect.label)
+    if {*beside.labels} != {*without.model.labels}:
+        return None
+    gain = quality(estimate) - quality(without)
+    if not gain >= steps.least(step.ranking, step.name):
+        return None
+    ranking = steps.rank(replace(estimate, model=beside), others)
+    own = ranking.statistic.get(step.name, -np.inf)
+    return ranking if own >= _least(steps, ranking, step.name) else None
 
 
 def _one_for_two(

@@ -202,7 +202,8 @@ class Isolability:
         apart: by two effects, the size of the first from which it is told from the second with 95 %; infinite where it
             never is.
         not_testable: effects that the campaign does not show, with the reason.
-        tests: further tests, the most helpful first, each with `apart` as it is after it.
+        tests: further tests, the most helpful first, and a second thermometer where there is one, each with `apart` as
+            it is after it, also of effects that the campaign itself does not show, from where they are found.
         std: size of each effect's first parameter that is one standard deviation of the noise, were it alone.
         cosine: by two effects, how much alike they are, whitened and beside the model; 1 where nothing parts them.
     """
@@ -276,10 +277,14 @@ def isolability(campaign: Campaign, model: GyroModel, *, tests: bool = True) -> 
     for measured, sentence in runs:
         after = _sizes(measured, model)
         gained = sum(_nats(now.apart[pair], after.apart[pair]) for pair in in_doubt if pair in after.apart)
-        # What the campaign did not show would have had another's name.
-        closest = [after.closest(name) for name in after.detectable if name not in now.detectable]
+        known = {*now.detectable, *CATALOGUE}  # not what follows a column that is made up
+        apart = {(a, b): size for (a, b), size in after.apart.items() if {a, b} <= known}
+        # What the campaign did not show would have had another's name; told apart is only what is found.
+        new = {a for a, _ in apart} - {*now.detectable}
+        apart |= {(a, b): max(size, after.detectable[a]) for (a, b), size in apart.items() if a in new}
+        closest = [after.closest(name, apart) for name in new]
         gained += sum(_nats(Size(np.inf, rival[1].unit), rival[1]) for rival in closest if rival)
-        helped.append((gained, sentence, after.apart))
+        helped.append((gained, sentence, apart))
     helped.sort(key=lambda item: -item[0])
     return replace(now, tests=tuple((sentence, after) for _, sentence, after in helped))
 

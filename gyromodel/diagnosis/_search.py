@@ -45,27 +45,30 @@ def search(steps: Steps, progress: Progress = None) -> Selection:
 
 
 def _begun_with_common(steps: Steps, progress: Progress, selection: Selection) -> Selection:
-    """The search begun with what every gyro has, where the simulation lacks it and that explains all, and better.
+    """The search begun with what every gyro has, where the simulation lacks it.
 
-    A curve, or any function of a column, stands for a bias and something simpler at once.
+    A curve, or any function of a column, stands for a bias and something simpler at once. What is begun so counts
+    where it leaves nothing: for a driver, or what it surely leads. Of a name that it leads by less, either is told.
     """
-    bank, first, names = steps.scanner.bank, selection.first, {f.name for f in selection.found}
-    common = [name for name in bank.names() if bank.price(name) < 0.0 and name not in names]
-    for name in common if names or selection.driver else ():
+    bank, first = steps.scanner.bank, selection.first
+    # Which points are right, and what is noise, is settled before.
+    if any(f.effect is None for f in selection.found):
+        return selection
+    for name in (name for name in bank.names() if bank.price(name) < 0.0):
+        old = [f.name for f in selection.found]
+        if name in old or not (old or selection.driver) or selection.either:
+            continue
         if not first.statistic.get(name, -np.inf) >= steps.least(first, name):
             continue
         other = _rounds(steps, progress, begin=name)
-        if other.unfinished or all(f.name != name for f in other.found):
+        found = [f.name for f in other.found]
+        if other.unfinished or name not in found:
             continue
+        new, gone = [k for k in found if k not in (name, *old)], [k for k in old if k not in found]
         if selection.driver or steps.fits_better(other.found, selection.found, SURELY):
             selection = other
-        elif steps.fits_better(other.found, selection.found):
-            new, old = (
-                [f.name for f in one.found if f.effect is not None and f.name not in {g.name for g in two.found}]
-                for one, two in ((other, selection), (selection, other))
-            )
-            simpler = [k for k in new if k != name]
-            selection = replace(other, either=((simpler or new)[0], old[0])) if old else other
+        elif len(gone) == 1 and len(new) < 2 and steps.fits_better(other.found, selection.found):
+            selection = replace(other, either=((new or [name])[0], gone[0]))
     return selection
 
 
@@ -83,7 +86,7 @@ def _rounds(steps: Steps, progress: Progress, avoid: str = "", begin: str = "") 
         remains = "bias_periodic" if full and lines >= threshold else ""
         barred = ("bias_periodic" if full else "", "" if path else avoid, *lost)
         name, score = ranking.best(drivers=False, but=barred)
-        if begin and not path:
+        if begin and not path and begin not in lost:
             name, score = begin, ranking.statistic[begin]
         for more in (f.name for f in path if f.grows and f.name not in lost):
             if ranking.statistic.get(more, -np.inf) > score - DOUBT:
@@ -127,7 +130,7 @@ def _rounds(steps: Steps, progress: Progress, avoid: str = "", begin: str = "") 
         # One smooth driver explains more than all the names together; names of its own columns may have had to stand
         # back behind one that follows several of them.
         own, first = {measured(column)[0] for column in smooth_columns(str(driver))}, path[0].effect
-        if not avoid and first is not None and not own >= set(first.columns_needed):
+        if not (avoid or begin) and first is not None and not own >= set(first.columns_needed):
             other = steadied(steps, _rounds(steps, progress, path[0].name))
             if other.found:
                 return other

@@ -282,7 +282,10 @@ def unknown_cases(count: int, seed: int, times_mde: float, noises: Iterable[str]
 
 
 def pair_cases(count: int, seed: int, times_mde: float, noises: Iterable[str] = FAMILY[:3]) -> list[Case]:
-    """Two catalogue effects at once, of those that one run tells from noise; neither contains the other."""
+    """Two catalogue effects at once, of those that one run tells from noise; neither contains the other.
+
+    A curve holds a slope, and a Shupe effect that changes with temperature one that does not.
+    """
     cells = [
         (d, n, a, b)
         for d in (A, B, C)
