@@ -60,6 +60,34 @@ def test_steady_lines_are_named_and_no_band_is_told_of(rng: np.random.Generator)
     assert not any("oscillates" in line for line in found.findings)
 
 
+@pytest.mark.parametrize("beat", [0.0, pytest.param(2.0, marks=pytest.mark.long)])
+def test_what_alternates_and_may_change_slowly_is_no_line(beat: float, rng: np.random.Generator) -> None:
+    """`beat`: cycles a record from half the sample rate. A change of any course has few of them."""
+    wave = 2.0 * np.cos(2 * np.pi * (0.5 - beat / ROWS) * TIME + 0.4)
+    found = gm.diagnose(log(5 + wave + 0.5 * rng.normal(size=ROWS)), gm.model_from_effects(["bias"]), hold_out=False)
+    assert (found.verdict, [c.effect for c in found.causes]) == ("unknown", [])
+    assert any("no steady line" in line and "half the sample rate" in line for line in found.findings)
+
+
+def test_a_line_further_from_half_the_sample_rate_is_named(rng: np.random.Generator) -> None:
+    wave = 2.0 * np.cos(2 * np.pi * (0.5 - 6.0 / ROWS) * TIME + 0.4)
+    found = gm.diagnose(log(5 + wave + 0.5 * rng.normal(size=ROWS)), gm.model_from_effects(["bias"]), hold_out=False)
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["bias_periodic"])
+
+
+def test_a_column_that_is_shaken_as_the_gyro_is_is_told_of(rng: np.random.Generator) -> None:
+    """A dither faster than the samples, whose frequency wanders, moves the output and an accelerometer."""
+    phase = 2 * np.pi * (400.13 * TIME + 2.0 * np.sin(2 * np.pi * TIME / 700))
+    columns = {"time": TIME, "output": 5 + np.sin(phase) + 0.5 * rng.normal(size=ROWS)}
+    columns |= {"acceleration_input": 0.1 * np.cos(phase) + 0.1 * rng.normal(size=ROWS)}
+    columns |= {"acceleration_output": 0.1 * rng.normal(size=ROWS)}
+    units = {"time": "s", "output": "deg/h", "acceleration_input": "m/s^2", "acceleration_output": "m/s^2"}
+    campaign = gm.Campaign(columns, units, {"kind": "rate"})
+    found = gm.diagnose(campaign, gm.model_from_effects(["bias"]), hold_out=False)
+    assert found.verdict == "unknown"
+    assert any("acceleration_input oscillates there too" in line for line in found.findings)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("walk", [0.0, 0.1])
 def test_a_steady_line_is_never_said_to_change(walk: float, rng: np.random.Generator) -> None:

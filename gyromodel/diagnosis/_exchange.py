@@ -153,8 +153,8 @@ def _chosen_again(
     return found, estimate, rankings
 
 
-def steady(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[list[Found], Estimate, str]:
-    """What was found less the lines that change or are noise of a band, its fit, and what is to be said of the first.
+def steady(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[list[Found], Estimate, list[float]]:
+    """What was found less the lines that change or are noise of a band, its fit, and the first's frequencies (Hz).
 
     Where these are the stronger, no line stands: the others are parts of the same.
     """
@@ -177,11 +177,7 @@ def steady(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[list[F
             break
         found, estimate = others, after
         changing += [line.frequency for line, b in zip(lines, bad & ~noise, strict=True) if b]
-    if not changing:
-        return found, estimate, ""
-    places = " and ".join(f"{frequency:.4g} Hz" for frequency in sorted(changing))
-    said = f"What oscillates near {places} changes its size or its frequency: it is no steady line, and is not named."
-    return found, estimate, said
+    return found, estimate, sorted(changing)
 
 
 def uncontested(step: Found) -> bool:

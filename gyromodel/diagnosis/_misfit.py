@@ -7,15 +7,19 @@ that changes is fitted by its mean, and the rest of it is left, like whatever os
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
 from scipy.stats import chi2, f, norm
 
+from gyromodel._checks import listed
 from gyromodel.campaign import AXES
+from gyromodel.diagnosis._drivers import driver_names
 from gyromodel.diagnosis._lines import lines_of, near
 from gyromodel.estimate import Estimate, filter_of, whiten_columns
+from gyromodel.signals import Record
 
 # Probability below which what is left is no noise.
 SELDOM = 1e-4
@@ -25,10 +29,14 @@ LEFT = 1e-2
 BENDS, UNSTEADY = 4, 0.2
 # Lines nearer to each other than this, over the length of the record, are as well one that changes.
 NEAR = 1.5
+# Cycles a record up to which a line's distance from half the sample rate is no beat but any slow change of what
+# alternates from sample to sample, as folded mains do: no noise of the fits is of that kind, as a walk is of slow bias.
+ALTERNATING = 4.0
 # Ordinates of a band of frequencies, and its power over that of the others, from which on it is told of.
 NARROWEST, EXCESS = 8, 1.25
-# Ordinates nearest to a line that tell of the noise there.
-BESIDE = 32
+# Ordinates nearest to a line that tell of the noise there, and how many times the power next to these a column has that
+# oscillates too.
+BESIDE, SHAKEN = 32, 2.0
 # Spreads beyond which a sample is a tail: two such side by side would make a band by themselves.
 TAIL = 4.0
 # Runs whose intervals differ by more than this ratio have no frequencies in common.
@@ -82,19 +90,24 @@ def axis_probabilities(estimate: Estimate) -> dict[str, float]:
 
 
 def unsteady_lines(estimate: Estimate) -> list[bool]:
-    """Whether each line of a model has, or may have, another size or frequency at other times of its campaign."""
+    """Whether each line of a model has, or may have, another size or frequency at other times of its campaign.
+
+    Near half the sample rate it may.
+    """
     model, record, lines = estimate.model, estimate.record, lines_of(estimate.model)
     if not lines:
         return []
     time = np.asarray(record.signals["time"])[: record.rows]
     number = np.asarray(record.signals.get("campaign", np.ones_like(time)))[: record.rows]
-    bent = []
+    bent, alternating = [], list[bool]()
     for line in lines:
         within = number == line.campaign if line.campaign else number > 0
         begin, end = time[within].min(), time[within].max()
         bends = legvander(2 * (time - begin) / (end - begin) - 1, BENDS)[:, 1:] * within[:, None]
         wave = np.exp(2j * np.pi * line.frequency * time)[:, None] * bends
         bent += [wave.real, wave.imag]
+        beat = (0.5 / record.interval - line.frequency) * (end - begin)
+        alternating.append(bool(beat < ALTERNATING))
     jacobian = np.asarray(model.linearise(record.signals)[1])
     p = jacobian.shape[1]
     columns = np.pad(jacobian, ((0, 0), (0, 2 * BENDS * len(lines))))
@@ -110,7 +123,43 @@ def unsteady_lines(estimate: Estimate) -> list[bool]:
         changing = float(np.sum((left.T @ residual) ** 2))
         seldom = chi2.sf(changing, left.shape[1]) * len(lines) < SELDOM
         beside = any(near(lines[k], other, NEAR / record.span) for other in lines[:k] + lines[k + 1 :])
-        found.append(beside or bool(seldom and changing > UNSTEADY * (changing + sizes_of[k])))
+        changes = bool(seldom and changing > UNSTEADY * (changing + sizes_of[k]))
+        found.append(beside or alternating[k] or changes)
+    return found
+
+
+def changed(record: Record, frequencies: Sequence[float]) -> str:
+    """What is said of lines that change, by their frequencies (Hz)."""
+    places, fastest = listed([f"{line:.4g}" for line in frequencies]), 0.5 / record.interval
+    said = f"What oscillates near {places} Hz changes its size or its frequency: no steady line, and not named."
+    if (fastest - max(frequencies)) * record.span < ALTERNATING:
+        said += (
+            f" {fastest:.4g} Hz is half the sample rate: there the output alternates from one sample to the next, by "
+            "an amount that may change. Faster lines that sampling folds, or a converter, do so: log at another rate."
+        )
+    if moved := _oscillate(record, frequencies):
+        said += (
+            f" {listed(moved)} {'oscillates' if len(moved) == 1 else 'oscillate'} there too: what shakes the gyro, as "
+            "a dither that sampling folds, moves both, so that one follows the other and need not be its cause."
+        )
+    return said
+
+
+def _oscillate(record: Record, frequencies: Sequence[float]) -> list[str]:
+    """Measured columns that have more power about some frequencies than next to them, and not by chance."""
+    if len(np.unique(record.run[: record.rows])) > 1:
+        return []
+    ordinates = np.arange(1, record.rows // 2)
+    fast = [line * record.span for line in frequencies if line * record.span > 2 * BESIDE]
+    about, further = (np.any([np.abs(ordinates - k) <= n * BESIDE for k in fast], axis=0) for n in (1, 3))
+    if not (further > about).any():
+        return []
+    found = []
+    for name in driver_names(record):
+        power = np.abs(np.fft.rfft(np.asarray(record.signals[name])[: record.rows])[1 : len(ordinates) + 1]) ** 2
+        ratio = power[about].mean() / max(power[further > about].mean(), np.finfo(float).tiny)
+        if ratio > SHAKEN and f.sf(ratio, 2 * about.sum(), 2 * (further > about).sum()) < SELDOM:
+            found.append(name)
     return found
 
 

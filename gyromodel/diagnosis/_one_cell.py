@@ -330,7 +330,9 @@ class OneCell:
     def _exact_peaks(self, t: np.ndarray, c: np.ndarray, s: np.ndarray) -> dict[int, float]:
         """Correct the statistic around the leading peaks, in place, by their exact energy; what each explains."""
         assert self._scanner.lines is not None
-        local = np.flatnonzero((t[1:-1] >= t[:-2]) & (t[1:-1] >= t[2:])) + 1
+        # Half the sample rate, where each run's lines end, is a peak like any; where they begin slow things end.
+        after = np.pad(t.reshape(len(self._scanner.lines.campaigns), -1)[:, 1:], ((0, 0), (0, 1))).ravel()
+        local = np.flatnonzero((t[1:] >= t[:-1]) & (t[1:] >= after[1:])) + 1
         peaks = local[np.argsort(-t[local])][:PEAKS]
         if not len(peaks):
             return {}
