@@ -117,7 +117,7 @@ def _counts(found: Searched) -> Estimate | None:
     stepped = quantisation(free, found.session.threshold, last if last.noise_given else None) if free else None
     band = None if selection.unresolved else excess_band(free or last)
     if band:
-        found.findings.append(band.told)
+        found.findings.append(band.told(found.session.record))
     # Where a band of the faster half is left besides, neighbours fall apart otherwise than a count's errors do.
     if stepped is None or (band and band.high > 0.25 / found.session.record.interval):
         return None

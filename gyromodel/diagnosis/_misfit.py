@@ -7,7 +7,7 @@ that changes is fitted by its mean, and the rest of it is left, like whatever os
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -50,13 +50,13 @@ class Band(NamedTuple):
     high: float
     ratio: float
 
-    @property
-    def told(self) -> str:
-        """What is said of it."""
+    def told(self, record: Record) -> str:
+        """What is said of it, and of measured columns that have more power there too."""
+        places = np.linspace(self.low, self.high, 2 + int((self.high - self.low) * record.span / BESIDE))
         return (
             f"Noise of the fitted kinds does not explain what is left from {self.low:.3g} to {self.high:.3g} Hz, with "
             f"{self.ratio:.2g} times the power of the rest: something oscillates there that is no steady line, or it "
-            "is noise of another kind."
+            "is noise of another kind." + shaken(record, places)
         )
 
 
@@ -128,7 +128,7 @@ def unsteady_lines(estimate: Estimate) -> list[bool]:
     return found
 
 
-def changed(record: Record, frequencies: Sequence[float]) -> str:
+def changed(record: Record, frequencies: list[float]) -> str:
     """What is said of lines that change, by their frequencies (Hz)."""
     places, fastest = listed([f"{line:.4g}" for line in frequencies]), 0.5 / record.interval
     said = f"What oscillates near {places} Hz changes its size or its frequency: no steady line, and not named."
@@ -137,30 +137,31 @@ def changed(record: Record, frequencies: Sequence[float]) -> str:
             f" {fastest:.4g} Hz is half the sample rate: there the output alternates from one sample to the next, by "
             "an amount that may change. Faster lines that sampling folds, or a converter, do so: log at another rate."
         )
-    if moved := _oscillate(record, frequencies):
-        said += (
-            f" {listed(moved)} {'oscillates' if len(moved) == 1 else 'oscillate'} there too: what shakes the gyro, as "
-            "a dither that sampling folds, moves both, so that one follows the other and need not be its cause."
-        )
-    return said
+    return said + shaken(record, frequencies)
 
 
-def _oscillate(record: Record, frequencies: Sequence[float]) -> list[str]:
-    """Measured columns that have more power about some frequencies than next to them, and not by chance."""
+def shaken(record: Record, frequencies: Iterable[float]) -> str:
+    """What is said of measured columns that have more power about some frequencies (Hz) than next to them."""
     if len(np.unique(record.run[: record.rows])) > 1:
-        return []
+        return ""
     ordinates = np.arange(1, record.rows // 2)
     fast = [line * record.span for line in frequencies if line * record.span > 2 * BESIDE]
     about, further = (np.any([np.abs(ordinates - k) <= n * BESIDE for k in fast], axis=0) for n in (1, 3))
     if not (further > about).any():
-        return []
-    found = []
+        return ""
+    moved = []
     for name in driver_names(record):
         power = np.abs(np.fft.rfft(np.asarray(record.signals[name])[: record.rows])[1 : len(ordinates) + 1]) ** 2
         ratio = power[about].mean() / max(power[further > about].mean(), np.finfo(float).tiny)
         if ratio > SHAKEN and f.sf(ratio, 2 * about.sum(), 2 * (further > about).sum()) < SELDOM:
-            found.append(name)
-    return found
+            moved.append(name)
+    if not moved:
+        return ""
+    there = "oscillates there too" if len(moved) == 1 else "oscillate there too"
+    return (
+        f" {listed(moved)} {there}: what shakes the gyro, as a dither that sampling folds, moves both, so that one "
+        "follows the other and need not be its cause."
+    )
 
 
 def lines_of_noise(estimate: Estimate) -> list[bool]:
