@@ -12,7 +12,7 @@ from gyromodel._checks import CampaignError
 from gyromodel._output_rate import rate_output, rate_scale
 from gyromodel.campaign import Campaign
 from gyromodel.noise import NOISE_UNITS as _STATED_UNITS
-from gyromodel.noise import Deviation, Estimator, IdentifiedNoise, deviation, identify_noise, with_gaps
+from gyromodel.noise import Deviation, Estimator, IdentifiedNoise, deviation, identify_noise, usual_interval, with_gaps
 from gyromodel.numerics.rounding import quantum
 from gyromodel.units import UnitError, convertible, factor, internal_unit
 
@@ -170,7 +170,7 @@ def analyse_noise(campaign: Campaign, progress: Callable[[str, float], None] | N
     except ValueError as error:
         raise CampaignError(f"{campaign.name}: {error}") from error
     known = np.isfinite(rate)
-    interval = float(np.median(np.diff(time[known])))
+    interval = usual_interval(time[known])
     even = with_gaps(rate[known], time[known], interval)
     most = max(len(even) // 2, 1)
     lengths = np.unique(np.geomspace(1, most, int(LENGTHS_PER_DECADE * np.log10(most)) + 2).round().astype(int))

@@ -10,7 +10,7 @@ from scipy.stats import binom
 
 from gyromodel.campaign import Campaign
 from gyromodel.files import read_campaign
-from gyromodel.noise import IdentifiedNoise, deviation, identify_noise
+from gyromodel.noise import IdentifiedNoise, deviation, identify_noise, usual_interval
 from gyromodel.noise import _reduced as reduction
 from gyromodel.noise._identify import KINDS
 from gyromodel.noise._lines import find_lines
@@ -199,6 +199,13 @@ def test_lines_and_trend_are_taken_out_of_the_noise(fixed: np.random.Generator):
     assert ramp.value == pytest.approx(1e-3, rel=0.1)
     assert found.terms["noise_white"].value == pytest.approx(N, rel=0.1)
     assert found.fits
+
+
+def test_the_interval_of_rounded_times_is_their_mean_within_gaps():
+    """64.06 samples a second, in tenths of a millisecond: most steps are 15.6 ms, and lines would be 0.07 % too fast."""
+    time = np.round(np.arange(10_000) / 64.06, 4)
+    time[5000:] += 100.0
+    assert usual_interval(time) == pytest.approx(1 / 64.06, rel=1e-5)
 
 
 @pytest.mark.law

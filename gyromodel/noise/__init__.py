@@ -2,7 +2,7 @@
 a record.
 """
 
-from gyromodel.noise._deviation import Deviation, Estimator, deviation, with_gaps
+from gyromodel.noise._deviation import Deviation, Estimator, deviation, usual_interval, with_gaps
 from gyromodel.noise._identify import IdentifiedNoise, Line, identify_noise
 from gyromodel.noise._likelihood import CellFit, from_grams, gram_by_cell, restricted_likelihood
 from gyromodel.noise._model import (
@@ -47,5 +47,6 @@ __all__ = [
     "noise_units",
     "restricted_likelihood",
     "stated_ratios",
+    "usual_interval",
     "with_gaps",
 ]

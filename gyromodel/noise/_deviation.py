@@ -124,6 +124,12 @@ def deviation(
     return Deviation(lengths * interval, np.sqrt(variance), low, high, lengths, terms, freedom, exponent)
 
 
+def usual_interval(time: Float[np.ndarray, " sample"]) -> float:
+    """The mean of the steps of time that leave out no sample, in its unit: rounded times have none that is right."""
+    steps = np.diff(time)
+    return float(steps[steps <= MISSING_STEP * np.median(steps)].mean())
+
+
 def with_gaps(
     rate: Float[np.ndarray, " sample"], time: Float[np.ndarray, " sample"], interval: float
 ) -> Float[np.ndarray, " row"]:

@@ -17,7 +17,7 @@ from scipy.stats import chi2, gamma, norm
 from threadpoolctl import threadpool_limits
 
 from gyromodel._checks import MISSING_STEP
-from gyromodel.noise._deviation import Deviation, deviation, with_gaps
+from gyromodel.noise._deviation import Deviation, deviation, usual_interval, with_gaps
 from gyromodel.noise._fits import FLICKER, LARGEST, MARKOV, SMALLEST, TIME_CONSTANT, WHITE, Fits, Model
 from gyromodel.noise._lines import (
     HANN,
@@ -149,7 +149,7 @@ def identify_noise(
 
 
 def _identify(rate: np.ndarray, time: np.ndarray, tell: Callable[[str, float], None]) -> IdentifiedNoise:
-    interval, span = float(np.median(np.diff(time))), float(time[-1] - time[0])
+    interval, span = usual_interval(time), float(time[-1] - time[0])
     scale = float(rate.std())
     y = (rate - rate.mean()) / scale
     clean = _longest(time, MISSING_STEP * interval)
