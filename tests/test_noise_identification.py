@@ -202,7 +202,7 @@ def test_lines_and_trend_are_taken_out_of_the_noise(fixed: np.random.Generator):
 
 
 def test_the_interval_of_rounded_times_is_their_mean_within_gaps():
-    """64.06 samples a second, in tenths of a millisecond: most steps are 15.6 ms, and lines would be 0.07 % too fast."""
+    """64.06 samples a second, in tenths of a millisecond: most steps are 15.6 ms, 0.07 % too short."""
     time = np.round(np.arange(10_000) / 64.06, 4)
     time[5000:] += 100.0
     assert usual_interval(time) == pytest.approx(1 / 64.06, rel=1e-5)
