@@ -25,7 +25,6 @@ SIZES = (0.5, 1.0, 2.0, 3.0, 10.0)
 # Channels that a campaign measures, of those that unknown effects follow.
 MEASURED = ("temperature", "rate", "supply_voltage", "pressure")
 WALK = "noise_random_walk"
-SOME = 3  # one in so many of the effects of the detectable size is shown to an oracle
 # Row 18: processor seconds that must do, and seconds that are wished for.
 MUST_SECONDS, GOAL_SECONDS = 60.0, 10.0
 TIMED_DRAWS = 2000  # of the calibration of a diagnosis that is timed
@@ -316,7 +315,7 @@ def asked(label: str, records: list[study.Record]) -> list[study.Record]:
 
 def _shown(record: study.Record) -> bool:
     """Whether a campaign of row 5 is one of those that an oracle is shown at the detectable size."""
-    return bool(levels.alone([record])) and record.case.seed % SOME == 0
+    return bool(levels.alone([record])) and record.case.seed % study.SOME == 0
 
 
 def _bounds(parts: dict[str, list[study.Record]], told: dict[str, list[Told]]) -> list[str]:
@@ -343,6 +342,10 @@ def _bounds(parts: dict[str, list[study.Record]], told: dict[str, list[Told]]) -
     inseparable = [len(t.said) > 1 and r.case.effect in t.said for r, t in both.get("inseparable", [])]
     counted["12", "ambiguous with the truth"] = inseparable
     counted["14", "noise class"] = [max(t.kinds, key=t.kinds.__getitem__) == r.case.noise for r, t in nulls]
+    anyhow = [(r, t.anyhow) for r, t in nulls if t.anyhow]
+    here = 100 * np.mean([r.answer and r.answer.noise == levels.NOISE_KINDS[r.case.noise] for r, _ in anyhow] or [0.0])
+    classed = [max(kinds, key=kinds.__getitem__) == r.case.noise for r, kinds in anyhow]
+    counted["14", f"noise class with nothing known of levels, where it is {here:.0f} % here"] = classed
     return [
         f"| {row} | what bounds it: {measure}, by an oracle that knows how levels are drawn | – | – | "
         f"{100 * np.mean(flags):.1f} % | {len(flags)} | – | |"

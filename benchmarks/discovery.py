@@ -45,8 +45,8 @@ INSEPARABLE, CALIBRATED, MUTATED = 120, 200, 60
 FEWEST = 24
 # Parts that an oracle is asked about which knows how levels of noise are drawn.
 ORACLE = (
-    "nothing", "nothing, moving", "inseparable", "unknown 10", "unknown 10, moving", "effects 1", "effects 1, white",
-    "effects 10", "effects 10, white",
+    "nothing", "effects 1", "effects 1, white", "effects 10", "effects 10, white", "unknown 10", "unknown 10, moving",
+    "inseparable", "nothing, moving",
 )  # fmt: skip
 DRAWS = 200  # of a calibration whose p-values are looked at
 # Diagnoses timed: campaigns of about 1000 rows.

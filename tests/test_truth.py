@@ -431,6 +431,20 @@ def test_oracle_of_noise_is_right_as_often_as_it_says(rng):
     assert np.mean(right) > 0.4  # a guess: 0.25
 
 
+@pytest.mark.parametrize(("levels_of", "seen"), [(noise.FLICKER, True), ((3.0, 4.0), False)])
+def test_without_levels_the_oracle_of_noise_tells_what_is_plain(levels_of, seen, rng, monkeypatch):
+    """Flicker as the study draws it and, far below the white, where no kind but that is seen."""
+    monkeypatch.setattr(noise, "FLICKER", levels_of)
+    rows, right = 250, 0
+    for _ in range(6):
+        design = some_rows(DESIGNS[C](rng), rows)
+        data = 1e-3 + noise.draw("flicker", design, rng).sample(design, rng)
+        shares = laws.kinds_of_any_level(data, design, np.ones((rows, 1)))
+        assert sum(shares.values()) == pytest.approx(1.0)
+        right += (shares["flicker"] + shares["flicker_and_walk"] > 0.5) == seen
+    assert right >= 4
+
+
 @pytest.mark.long
 def test_oracle_of_effects_is_right_as_often_as_it_says(rng):
     """A drift or a step or neither, each as likely, of sizes from the oracle's prior, in noise of any kind."""

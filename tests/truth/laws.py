@@ -15,7 +15,7 @@ from scipy.special import logsumexp
 
 from .contest import Library, orthonormal
 from .designs import Design
-from .noise import FAMILY, family
+from .noise import ANY_FLICKER, ANY_WALK, FAMILY, family
 
 Array = np.ndarray
 # Evidence (nats) from which something is said, as the engine's; sizes of the prior.
@@ -23,10 +23,14 @@ NEEDED, SIZES = 3.0, np.array([1e1, 1e2, 1e3, 1e4])
 
 
 class Told(NamedTuple):
-    """Shares of the posterior of each kind of noise with nothing hidden, and ln B of each signal against that."""
+    """Shares of the posterior of each kind of noise with nothing hidden, and ln B of each signal against that.
+
+    `anyhow` are the shares of kinds where nothing is known of levels, of some campaigns.
+    """
 
     kinds: dict[str, float]
     evidence: dict[str, float]
+    anyhow: dict[str, float] | None = None
 
     @property
     def said(self) -> tuple[str, ...]:
@@ -36,6 +40,20 @@ class Told(NamedTuple):
         order = sorted(self.evidence, key=lambda name: -self.evidence[name])
         shares = np.exp([self.evidence[name] - logsumexp(list(self.evidence.values())) for name in order])
         return tuple(order[: int(np.searchsorted(np.cumsum(shares), 0.95)) + 1])
+
+
+def kinds_of_any_level(data: Array, design: Design, fixed: Array) -> dict[str, float]:
+    """Shares of the posterior of each kind of noise, nothing hidden, where nothing is known of levels."""
+    p, freedom = fixed.shape[1], len(data) - fixed.shape[1]
+    kinds: dict[str, list[float]] = {kind: [] for kind in FAMILY}
+    for kind, weight, covariance in family(design, 16, ANY_FLICKER, ANY_WALK):
+        L = cholesky(covariance, lower=True, overwrite_a=True, check_finite=False)
+        R = np.linalg.qr(solve_triangular(L, np.column_stack([fixed, data]), lower=True), mode="r")
+        rss = R[p, p] ** 2
+        plain = -np.log(np.diag(L)).sum() - np.log(np.abs(np.diag(R)[:p])).sum() - freedom / 2 * np.log(rss)
+        kinds[kind].append(plain + np.log(weight))
+    nothing = logsumexp([value for values in kinds.values() for value in values])
+    return {kind: float(np.exp(logsumexp(values) - nothing)) for kind, values in kinds.items()}
 
 
 def tell(data: Array, design: Design, fixed: Array, signals: Library) -> Told:

@@ -150,6 +150,8 @@ def _fractional_covariance(rows: np.ndarray, alpha: float) -> Array:
 # Decades of the number of samples at which the Allan curves of flicker and of random walk cross the white: 5 to 40,
 # and 10 to 60.
 FLICKER, WALK = (0.7, 1.6), (1.0, 1.8)
+# The same for levels of which nothing is known: six decades of variance about these.
+ANY_FLICKER, ANY_WALK = (-1.85, 4.15), (-0.1, 2.9)
 
 
 def _flicker_level(N: float, step: float, decade: float) -> float:
@@ -189,19 +191,21 @@ def draw(kind: str, design: Design, rng: np.random.Generator) -> Noise:
     raise ValueError(f"no noise kind {kind!r}")
 
 
-def family(design: Design, points: int = 6) -> Iterator[tuple[str, float, Array]]:
+def family(
+    design: Design, points: int = 6, flicker_at: tuple[float, float] = FLICKER, walk_at: tuple[float, float] = WALK
+) -> Iterator[tuple[str, float, Array]]:
     """Kinds of noise, weights and covariances, the white of unit N, as `draw` draws them: kinds are as likely.
 
-    Gauss-Legendre nodes stand for the levels of a kind.
+    Gauss-Legendre nodes stand for the levels of a kind, as drawn or of other decades.
     """
     nodes, weights = np.polynomial.legendre.leggauss(points)
     nodes, weights = (nodes + 1) / 2, weights / 2
     rows, step = design.index, design.step
     white = Noise("white", 1.0).covariance(design)
     flicker, walk = (_fractional_covariance(rows, alpha) for alpha in (1.0, 2.0))
-    levels = [_flicker_level(1.0, step, FLICKER[0] + np.ptp(FLICKER) * node) for node in nodes]
+    levels = [_flicker_level(1.0, step, flicker_at[0] + np.ptp(flicker_at) * node) for node in nodes]
     flickers = [driving_variance(B, 1.0, step) * flicker for B in levels]
-    levels = [_walk_level(1.0, step, WALK[0] + np.ptp(WALK) * node) for node in nodes]
+    levels = [_walk_level(1.0, step, walk_at[0] + np.ptp(walk_at) * node) for node in nodes]
     walks = [driving_variance(K, 2.0, step) * walk for K in levels]
     yield "white", 1.0, white
     for weight, of_flicker in zip(weights, flickers, strict=True):
