@@ -345,13 +345,13 @@ def _bounds(parts: dict[str, list[study.Record]], told: dict[str, list[Told]]) -
     anyhow = [(r, t.anyhow) for r, t in nulls if t.anyhow]
     here = 100 * np.mean([r.answer and r.answer.noise == levels.NOISE_KINDS[r.case.noise] for r, _ in anyhow] or [0.0])
     classed = [max(kinds, key=kinds.__getitem__) == r.case.noise for r, kinds in anyhow]
-    counted["14", f"noise class with nothing known of levels, where it is {here:.0f} % here"] = classed
-    return [
-        f"| {row} | what bounds it: {measure}, by an oracle that knows how levels are drawn | – | – | "
-        f"{100 * np.mean(flags):.1f} % | {len(flags)} | – | |"
-        for (row, measure), flags in counted.items()
-        if flags
-    ]
+    counted["14", f"noise class, with nothing known of levels, where {here:.0f} % are right here"] = classed
+    rows = []
+    for (row, measure), flags in counted.items():
+        knows = "" if "nothing known of levels" in measure else " that knows how levels are drawn"
+        shown = f"what bounds it: {measure}, by an exact oracle{knows}"
+        rows += [f"| {row} | {shown} | – | – | {100 * np.mean(flags):.1f} % | {len(flags)} | – | |"] if flags else []
+    return rows
 
 
 def _ahead(both: list[tuple[study.Record, Told]]) -> list[bool]:

@@ -431,9 +431,9 @@ def test_oracle_of_noise_is_right_as_often_as_it_says(rng):
     assert np.mean(right) > 0.4  # a guess: 0.25
 
 
-@pytest.mark.parametrize(("levels_of", "seen"), [(noise.FLICKER, True), ((3.0, 4.0), False)])
+@pytest.mark.parametrize(("levels_of", "seen"), [((-0.5, 0.5), True), ((3.0, 4.0), False)])
 def test_without_levels_the_oracle_of_noise_tells_what_is_plain(levels_of, seen, rng, monkeypatch):
-    """Flicker as the study draws it and, far below the white, where no kind but that is seen."""
+    """Flicker as large as the white at a sample or three, and far below it, where none is seen."""
     monkeypatch.setattr(noise, "FLICKER", levels_of)
     rows, right = 250, 0
     for _ in range(6):
