@@ -10,7 +10,7 @@ import numpy as np
 from gyromodel.diagnosis._apart import like
 from gyromodel.diagnosis._forms import periodic
 from gyromodel.diagnosis._lines import lines_of, near
-from gyromodel.diagnosis._misfit import lines_of_noise, unsteady_lines
+from gyromodel.diagnosis._misfit import changed, lines_of_noise, unsteady_lines
 from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, is_driver, is_noise
 from gyromodel.diagnosis._steps import BETWEEN, EXCHANGE, Found, Steps, quality, standing
 from gyromodel.effects.drivers import BiasPeriodic
@@ -153,18 +153,19 @@ def _chosen_again(
     return found, estimate, rankings
 
 
-def steady(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[list[Found], Estimate, list[float]]:
-    """What was found less the lines that change or are noise of a band, its fit, and the first's frequencies (Hz).
+def steady(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[list[Found], Estimate, str]:
+    """What was found less the lines that change or are noise of a band, its fit, and what is said of the first.
 
-    Where these are the stronger, no line stands: the others are parts of the same.
+    Where these are the stronger, no line stands: the others may be parts of the same.
     """
-    given, changing, far = lines_of(steps.baseline.model), list[float](), 1.0 / estimate.record.span
+    given, far = lines_of(steps.baseline.model), 1.0 / estimate.record.span
+    changing, weaker = list[float](), list[float]()
     while any(f.name == "bias_periodic" for f in found):
         lines, effect = lines_of(estimate.model), estimate.model.effects[estimate.model.labels.index("bias_periodic")]
         assert isinstance(effect, BiasPeriodic)
         own = np.array([not any(near(line, g, far) for g in given) for line in lines])
         noise = np.array(lines_of_noise(estimate))
-        bad = own & (noise | np.array(unsteady_lines(estimate)))
+        bad = flagged = own & (noise | np.array(unsteady_lines(estimate)))
         power = np.asarray(effect.cosine**2 + effect.sine**2)
         if power[bad].sum() > power[own & ~bad].sum():
             bad = own
@@ -176,8 +177,11 @@ def steady(steps: Steps, found: list[Found], estimate: Estimate) -> tuple[list[F
         if after is None:
             break
         found, estimate = others, after
-        changing += [line.frequency for line, b in zip(lines, bad & ~noise, strict=True) if b]
-    return found, estimate, sorted(changing)
+        changing += [line.frequency for line, b in zip(lines, flagged & ~noise, strict=True) if b]
+        weaker += [line.frequency for line, b in zip(lines, bad & ~flagged, strict=True) if b]
+    if not changing:
+        changing, weaker = weaker, []
+    return found, estimate, changed(estimate.record, changing, weaker) if changing else ""
 
 
 def uncontested(step: Found) -> bool:

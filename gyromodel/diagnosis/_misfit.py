@@ -128,10 +128,12 @@ def unsteady_lines(estimate: Estimate) -> list[bool]:
     return found
 
 
-def changed(record: Record, frequencies: list[float]) -> str:
-    """What is said of lines that change, by their frequencies (Hz)."""
-    places, fastest = listed([f"{line:.4g}" for line in frequencies]), 0.5 / record.interval
+def changed(record: Record, frequencies: list[float], weaker: list[float]) -> str:
+    """What is said of lines that change, by their frequencies (Hz), and of weaker ones that are given up with them."""
+    places, others = (listed([f"{line:.4g}" for line in sorted(lines)]) for lines in (frequencies, weaker))
+    fastest = 0.5 / record.interval
     said = f"What oscillates near {places} Hz changes its size or its frequency: no steady line, and not named."
+    said += f" Nor is what oscillates more weakly near {others} Hz." if weaker else ""
     if (fastest - max(frequencies)) * record.span < ALTERNATING:
         said += (
             f" {fastest:.4g} Hz is half the sample rate: there the output alternates from one sample to the next, by "

@@ -15,7 +15,6 @@ from gyromodel.diagnosis._evidence import log_evidence_ratio, log_sum
 from gyromodel.diagnosis._exchange import DOUBT, SLOW_LEAD, exchanged, steady, unresolved
 from gyromodel.diagnosis._forms import MAXIMUM_LINES
 from gyromodel.diagnosis._lines import lines_of
-from gyromodel.diagnosis._misfit import changed
 from gyromodel.diagnosis._pairs import best_pair
 from gyromodel.diagnosis._ranking import SLOW_IN_TIME, Ranking, evidence_in, rank, skipped
 from gyromodel.diagnosis._selection import MAXIMUM_ROUNDS, Selection, significant_driver
@@ -170,7 +169,7 @@ def _rounds(steps: Steps, progress: Progress, avoid: str = "", begin: str = "") 
 
 def steadied(steps: Steps, selection: Selection) -> Selection:
     """A selection less the lines that change, which are told of as what remains, or are noise of a band."""
-    found, estimate, changing = steady(steps, list(selection.found), selection.estimate)
+    found, estimate, said = steady(steps, list(selection.found), selection.estimate)
     if estimate is selection.estimate:
         return selection
     ranking = steps.rank(estimate, found)
@@ -182,8 +181,8 @@ def steadied(steps: Steps, selection: Selection) -> Selection:
         estimates=(*selection.estimates[:-1], estimate),
         driver=significant_driver(ranking, steps.threshold, bool(found)),
         left_out={},
-        remains="bias_periodic" if changing else selection.remains,
-        unresolved=changed(estimate.record, changing) if changing else "",
+        remains="bias_periodic" if said else selection.remains,
+        unresolved=said,
     )
 
 
