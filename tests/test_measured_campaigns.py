@@ -56,15 +56,13 @@ def test_gravity_does_not_move_those_of_a_unit_that_is_compensated(measured_data
     assert found.verdict != "unknown"
 
 
-def test_the_codes_of_a_feedback_ramp_are_found_and_lines_that_wander_left_out(measured_data: Data):
+def test_the_codes_of_a_feedback_ramp_are_found_and_hold_later(measured_data: Data):
     """Of the 40 s after the first 40 the extended model leaves what a Fourier series of the code by hand does."""
     whole = gm.read_campaign(measured_data("fog_closed_loop_ramp/campaign.csv.gz"))
     time = whole.columns["time"] - whole.columns["time"][0]
     before, after = time < 40, (time >= 40) & (time < 80)
     found = gm.diagnose(whole.select(before), gm.model_from_effects(["bias"], gyro="fog"), hold_out=False)
     assert "bias_readout_code" in [c.effect for c in found.causes]
-    period = next(p.value for p in found.extended.table() if p.name == "period")
-    assert period == pytest.approx(2 * 32768, rel=0.02)
     later = read_signals(whole.select(after))
     left = np.asarray(later.signals["output"] - found.extended.model.predict(later.signals))[: later.rows]
     output, phase = whole.columns["output"], 2 * np.pi * whole.columns["feedback_ramp"] / 65560
