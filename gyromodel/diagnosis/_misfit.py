@@ -146,8 +146,8 @@ def shaken(record: Record, frequencies: Iterable[float]) -> str:
     """What is said of measured columns that have more power about some frequencies (Hz) than next to them."""
     if len(np.unique(record.run[: record.rows])) > 1:
         return ""
-    ordinates = np.arange(1, record.rows // 2)
-    fast = [line * record.span for line in frequencies if line * record.span > 2 * BESIDE]
+    ordinates, length = np.arange(1, record.rows // 2), record.rows * record.interval
+    fast = [line * length for line in frequencies if line * length > 2 * BESIDE]
     about, further = (np.any([np.abs(ordinates - k) <= n * BESIDE for k in fast], axis=0) for n in (1, 3))
     if not (further > about).any():
         return ""
