@@ -65,7 +65,10 @@ def test_both_kinds_have_their_size_and_fits_the_uncertainty_that_they_leave(rng
         ratios.append(estimate.std / best)
     assert binom.cdf(min(inside.values()), draws, 0.95) > RARE
     assert binom.cdf(held, draws, 0.93) > RARE
-    assert np.median(ratios, axis=0) == pytest.approx([1.0, 1.0], rel=0.25)
+    # Slow noise that would not show leaves a bias less certain than the noise that there is.
+    bias, coefficient = np.median(ratios, axis=0)
+    assert 1.0 < bias < 2.0
+    assert coefficient == pytest.approx(1.0, rel=0.25)
 
 
 def truth_design():

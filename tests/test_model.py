@@ -17,7 +17,7 @@ from gyromodel.campaign import Campaign
 from gyromodel.effects.drivers import Bias, BiasColumn, BiasDrift, BiasStep
 from gyromodel.effects.scale import ScaleAsymmetry, ScaleFactor, ScaleTemperature
 from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureCurve
-from gyromodel.estimate import fit_record
+from gyromodel.estimate import fit_record, with_noise_intervals
 from gyromodel.model import (
     GyroModel,
     ModelError,
@@ -225,8 +225,11 @@ def truth(noise: dict[str, float]) -> GyroModel:
 
 @pytest.mark.long
 def test_fit_of_a_simulation_covers_its_parameters(rng: np.random.Generator):
-    """Counts of 4e6 next to 1e-9 rad/s, no start values, noise of three kinds estimated alongside."""
-    model = truth({"noise_white": 5e-9, "noise_flicker": 4e-10, "noise_random_walk": 4e-12})
+    """Counts of 4e6 next to 1e-9 rad/s, no start values, noise of three kinds estimated alongside.
+
+    The flicker shows in most draws; docs/decisions.md says what the bias's interval covers where it hardly does.
+    """
+    model = truth({"noise_white": 5e-9, "noise_flicker": 2e-9, "noise_random_walk": 4e-12})
     measured = campaign(rng, "count/s")
     record = read_signals(measured)
     exact = simulate(GyroModel(model.effects), measured).columns["output"]
@@ -234,12 +237,29 @@ def test_fit_of_a_simulation_covers_its_parameters(rng: np.random.Generator):
     start = start.with_vector(jnp.asarray([jnp.nan, 0.0, 0.0, 0.0]))
     inside = np.zeros(4, int)
     for _ in range(SEEDS):
-        estimate = fit_record(with_output(record, exact + draw_noise(model, record, rng)), start)
+        estimate = with_noise_intervals(fit_record(with_output(record, exact + draw_noise(model, record, rng)), start))
         error = np.asarray(estimate.model.vector() - model.vector())
         inside += np.abs(error) < norm.isf(0.025) * estimate.std
         assert error[0] / 4e6 == pytest.approx(0.0, abs=1e-8)
-        assert error[1] == pytest.approx(0.0, abs=2e-8)
+        assert error[1] == pytest.approx(0.0, abs=4e-8)
     assert (binom.cdf(inside, SEEDS, 0.95) > RARE).all(), inside
+
+
+def test_a_bias_is_less_certain_where_noise_may_be_slow(rng: np.random.Generator):
+    """White noise that is estimated: what slow noise it may hide shows in no scale factor, but in a mean."""
+    model = truth({"noise_white": 5e-9})
+    measured = campaign(rng, "count/s")
+    record, exact = read_signals(measured), simulate(GyroModel(model.effects), measured).columns["output"]
+    ratios = []
+    for _ in range(8):
+        drawn = with_output(record, exact + draw_noise(model, record, rng))
+        likeliest = fit_record(drawn, GyroModel(model.effects))
+        ratios.append(with_noise_intervals(likeliest).std / likeliest.std)
+        stated = fit_record(drawn, model)
+        assert (with_noise_intervals(stated).std == stated.std).all()
+    scale, bias = np.median(ratios, axis=0)[:2]
+    assert 1.1 < bias < 2.0
+    assert scale == pytest.approx(1.0, abs=0.05)
 
 
 @pytest.mark.parametrize(

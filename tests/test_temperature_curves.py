@@ -48,7 +48,7 @@ def test_one_hinge_is_found_as_one_with_an_interval_of_its_place(rng: np.random.
 def test_shapes_that_stay_as_searched_are_told_of(rng: np.random.Generator):
     """A jump between two soaks, gone through to and fro: where in between, nothing tells."""
     soaks = [-30.0, 30.0, -10.0, 50.0, 10.0, -30.0, 10.0, -10.0, 30.0, 50.0]
-    temperature = np.repeat(soaks, 30) + 0.1 * rng.uniform(-1, 1, 300)
+    temperature = np.repeat(soaks, 30) + 0.01 * rng.uniform(-1, 1, 300)
     output = 0.5 * (temperature > 0) + 0.01 * rng.standard_normal(300)
     found = gm.diagnose(
         at_rest(temperature, output), gm.model_from_effects(["bias", "bias_temperature"]), hold_out=False

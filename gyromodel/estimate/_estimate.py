@@ -28,7 +28,8 @@ class Estimate:
 
     Attributes:
         model: at the estimate; its noise coefficients are filled in.
-        covariance: of the free parameters in the order of `model.slots()`, internal units.
+        covariance: of the free parameters in the order of `model.slots()`, internal units; of `fit` and `diagnose` with
+            what noise that was estimated leaves open.
         degrees_of_freedom: samples present less free parameters.
         residual: measured minus predicted output, internal output unit; NaN where missing.
         whitened: residual whitened to unit variance; NaN where missing.

@@ -1,4 +1,4 @@
-"""The noise of a fit: the cell of greatest restricted likelihood, and the range that a likelihood ratio leaves."""
+"""The noise of a fit: the likeliest cell, the range that a likelihood ratio leaves, and what that adds to errors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gyromodel.estimate._estimate import Estimate, EstimateError, noise_coeffici
 from gyromodel.estimate._rounding import white_before
 from gyromodel.estimate._whitening import filter_of, pad_columns, whiten_columns
 from gyromodel.model import GyroModel
-from gyromodel.noise import NoiseRatios, markov_cells, noise_grid, restricted_likelihood
+from gyromodel.noise import NoiseRatios, from_grams, gram_by_cell, markov_cells, noise_grid, restricted_likelihood
 from gyromodel.signals import Record
 
 Likelihood = Callable[[NoiseRatios], np.ndarray]
@@ -127,19 +127,22 @@ def settled(a: NoiseRatios, b: NoiseRatios) -> bool:
 
 
 def with_noise_intervals(estimate: Estimate) -> Estimate:
-    """The estimate with 95 % intervals of its noise coefficients, where the noise was estimated.
+    """The estimate with 95 % intervals of its noise coefficients, and with what they leave open in its covariance.
 
-    They are the coefficients' ranges over the noise cells that a likelihood ratio does not reject; of colour that so
-    few samples cannot show they have no end.
+    The intervals are the coefficients' ranges over the noise cells that a likelihood ratio does not reject; of colour
+    that so few samples cannot show they have no end. The variances of the parameters are means over these cells, by
+    likelihood and prior (that of the search), with what the parameters differ between cells; their correlations stay
+    those of the likeliest. An estimate in stated noise stays as it is.
     """
     if estimate.noise_given:
         return estimate
     record, gain = estimate.record, float(estimate.model.gain())
     predicted, jacobian = estimate.model.linearise(record.signals)
     residual = np.where(record.sampling.present, np.asarray(record.signals["output"]) - predicted, 0.0)
-    span = record.span
+    columns, span = np.column_stack([jacobian, residual]), record.span
     samples = int(record.present.sum())
     grid = noise_grid(samples, record.interval, span).ratios
+    bounds = [(float(np.min(r[r > 0], initial=np.inf)), float(r.max())) for r in map(np.asarray, grid.each())]
     if float(estimate.ratios.markov) > 0:
         grid = markov_cells(samples, record.interval, span)
     own = estimate.ratios.each()
@@ -149,7 +152,8 @@ def with_noise_intervals(estimate: Estimate) -> Estimate:
     ]
     levels += [float(b) * ANGLE_RANGE for b in own[len(levels) :]]
     for turn, margin in enumerate((4.0, 2.0, 2.0, 2.0, 0.0)):
-        result = restricted_likelihood(_mesh(levels), record.interval, span, record.sampling, jacobian, residual)
+        log_determinant, gram = gram_by_cell(_mesh(levels), record.interval, span, record.sampling, columns)
+        result = from_grams(log_determinant, gram, samples)
         below = result.log_likelihood.max() - result.log_likelihood
         # Only levels even on some scale are for splines.
         if not margin or (turn and np.sum(below < REJECTED) > 2 * INTERVAL_LEVELS * ANGLE_LEVELS ** (len(own) - 4)):
@@ -173,7 +177,41 @@ def with_noise_intervals(estimate: Estimate) -> Estimate:
     if len(grid.flicker) == 1:
         # So few samples show no colour: there may be any amount of it.
         spans |= {name: (0.0, np.inf) for name in spans if name != "noise_white"}
-    return replace(estimate, noise_interval=spans)
+        return replace(estimate, noise_interval=spans)
+    weight = result.log_likelihood - result.log_likelihood.max()
+    if float(estimate.ratios.markov) == 0:
+        priors = [_prior(np.unique(r), *b) for r, b in zip(levels, bounds, strict=False)]
+        weight += np.log(np.maximum(_outer(priors + [np.ones(len(r)) for r in levels[len(priors) :]]), 1e-300))
+    _, own_gram = gram_by_cell(_mesh(np.atleast_1d(r) for r in own), record.interval, span, record.sampling, columns)
+    factor = np.sqrt(_variances(gram, np.exp(weight), samples) / _variances(own_gram, np.ones(1), samples))
+    return replace(estimate, noise_interval=spans, covariance=estimate.covariance * np.outer(factor, factor))
+
+
+def _prior(levels: np.ndarray, least: float, most: float) -> np.ndarray:
+    """What levels of a noise ratio stand for of a prior with half on absent, and half even in logarithm in a range."""
+    if len(levels) == 1:
+        return np.ones(1)
+    root = np.sqrt(levels)
+    edges = np.concatenate([root[:1], 0.5 * (root[1:] + root[:-1]), root[-1:]]) ** 2
+    up_to = 0.5 + 0.5 * np.clip(np.log(np.maximum(edges, least) / least) / np.log(most / least), 0.0, 1.0)
+    up_to[0] -= 0.5 * (levels[0] == 0.0)
+    return np.diff(up_to)
+
+
+def _outer(parts: Sequence[np.ndarray]) -> np.ndarray:
+    """Products of one value of each part, in the order of `_mesh`."""
+    return np.prod(np.meshgrid(*parts, indexing="ij"), axis=0).ravel()
+
+
+def _variances(gram: np.ndarray, weight: np.ndarray, samples: int) -> np.ndarray:
+    """Of the parameters, over noise cells of such weights: the mean in a cell, and of the squared change to it."""
+    p = gram.shape[1] - 1
+    size = np.sqrt(np.einsum("gii->gi", gram[:, :p, :p]))
+    inverse = np.linalg.inv(gram[:, :p, :p] / (size[:, :, None] * size[:, None, :]))
+    change = np.einsum("gij,gj->gi", inverse, gram[:, :p, p] / size)
+    residual_sum = gram[:, p, p] - np.einsum("gi,gi->g", change, gram[:, :p, p] / size)
+    within = residual_sum[:, None] / (samples - p) * np.einsum("gii->gi", inverse)
+    return weight @ ((within + change**2) / size**2) / weight.sum()
 
 
 def _unit(ratio: np.ndarray, likely: np.ndarray, best: float) -> float:
