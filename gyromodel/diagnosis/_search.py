@@ -136,10 +136,10 @@ def _rounds(steps: Steps, progress: Progress, avoid: str = "", begin: str = "") 
                 return other
         return Selection(steps.baseline, (), (), path[0].ranking, (steps.baseline,), driver)
     for i in range(1, len(path)):
-        if not path[i - 1].paired and (driver := _ahead_of(path[i:], threshold)):
+        if not path[i - 1].paired and (ahead := _ahead_of(path[i:], threshold)):
             before, ranking = path[:i], path[i].ranking
             return Selection(
-                estimates[i], tuple(standing(before)), tuple(before), ranking, tuple(estimates[: i + 1]), driver
+                estimates[i], tuple(standing(before)), tuple(before), ranking, tuple(estimates[: i + 1]), ahead
             )
     found, left_out = standing(path), {}
     if sum(f.weighed for f in found) > 1:
@@ -149,6 +149,8 @@ def _rounds(steps: Steps, progress: Progress, avoid: str = "", begin: str = "") 
             ranking = steps.rank(estimates[-1], found)
             name, score = ranking.best(drivers=False, but=("bias_periodic",))
             remains = remains or (name if name and score >= steps.least(ranking, name) else "")
+    # Several steps in time are what a function of something looks like that goes to and fro: they have to lead surely.
+    steps_only = len(found) > 1 and all(f.name == "bias_step" for f in found)
     # What no fit holds is there all the same, unless something else took its place.
     there = {name: ranking.statistic[name] for name in lost if name in ranking.statistic}
     there = {name: score for name, score in there.items() if _significant(steps, ranking, name, score)}
@@ -163,7 +165,7 @@ def _rounds(steps: Steps, progress: Progress, avoid: str = "", begin: str = "") 
         left_out,
         remains,
         small,
-        rival=driver if lead > EXCHANGE else None,
+        rival=driver if lead > (-DOUBT if steps_only else EXCHANGE) else None,
     )
 
 
