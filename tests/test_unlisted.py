@@ -9,6 +9,7 @@ import pytest
 from scipy.stats import binom
 
 import gyromodel as gm
+from tests.truth import study
 
 STEP = 15.0
 TIME = STEP * np.arange(1200)
@@ -328,3 +329,15 @@ def test_what_a_moving_rate_does_otherwise_than_in_proportion(error: str, driver
     units = {name: "s" if name == "time" else "deg/s" for name in columns}
     measured = gm.Campaign(columns, units, {"kind": "rate"})
     assert followed(measured, "scale_factor") == driver
+
+
+def test_two_steps_in_time_may_be_what_follows_the_sign_of_a_rate():
+    """Joints that slip as soon as the temperature moves, on a cycle that turns twice; of these draws one was two steps.
+
+    Which of the two it is the campaign hardly tells: the function leads all steps together by 1.4 nats.
+    """
+    built = study.build(study.Case(1975787056949817, "static_cycle", "white", "temperature_rate_switch", 10.0))
+    measured = gm.Campaign(built.columns, built.units, built.metadata)
+    found = gm.diagnose(measured, gm.model_from_effects(["bias"]), hold_out=False)
+    assert (found.verdict, [c.effect for c in found.causes]) == ("ambiguous", ["bias_step"])
+    assert "smooth(d(temperature)/dt)" in found.credible_set

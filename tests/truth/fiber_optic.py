@@ -8,7 +8,7 @@ and the quantisation of the angle.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.signal import lfilter
@@ -36,10 +36,6 @@ class Gyro:
     quantisation: float = 0.68  # bit, a one-second sum's error from the angle at its ends
     white: float = 0.1  # bit
     walk: float = 0.0005  # bit per square root of a second
-
-    def without_shupe(self) -> Gyro:
-        """The same gyro without the effect of temperature rate."""
-        return replace(self, shupe=0.0)
 
 
 def chamber(hours: float, rng: np.random.Generator, step: float = 1.0) -> tuple[Array, Array]:
