@@ -178,12 +178,15 @@ def with_noise_intervals(estimate: Estimate) -> Estimate:
         # So few samples show no colour: there may be any amount of it.
         spans |= {name: (0.0, np.inf) for name in spans if name != "noise_white"}
         return replace(estimate, noise_interval=spans)
-    weight = result.log_likelihood - result.log_likelihood.max()
+    weight = result.log_likelihood
     if float(estimate.ratios.markov) == 0:
         priors = [_prior(np.unique(r), *b) for r, b in zip(levels, bounds, strict=False)]
-        weight += np.log(np.maximum(_outer(priors + [np.ones(len(r)) for r in levels[len(priors) :]]), 1e-300))
+        weight = weight + np.log(np.maximum(_outer(priors + [np.ones(len(r)) for r in levels[len(priors) :]]), 1e-300))
     _, own_gram = gram_by_cell(_mesh(np.atleast_1d(r) for r in own), record.interval, span, record.sampling, columns)
-    factor = np.sqrt(_variances(gram, np.exp(weight), samples) / _variances(own_gram, np.ones(1), samples))
+    averaged = _variances(gram, np.exp(weight - weight.max()), samples)
+    likeliest = _variances(own_gram, np.ones(1), samples)
+    # What leaves no residual has nothing to average.
+    factor = np.sqrt(np.divide(averaged, likeliest, out=np.ones_like(averaged), where=likeliest > 0.0))
     return replace(estimate, noise_interval=spans, covariance=estimate.covariance * np.outer(factor, factor))
 
 
@@ -210,7 +213,7 @@ def _variances(gram: np.ndarray, weight: np.ndarray, samples: int) -> np.ndarray
     inverse = np.linalg.inv(gram[:, :p, :p] / (size[:, :, None] * size[:, None, :]))
     change = np.einsum("gij,gj->gi", inverse, gram[:, :p, p] / size)
     residual_sum = gram[:, p, p] - np.einsum("gi,gi->g", change, gram[:, :p, p] / size)
-    within = residual_sum[:, None] / (samples - p) * np.einsum("gii->gi", inverse)
+    within = np.maximum(residual_sum, 0.0)[:, None] / (samples - p) * np.einsum("gii->gi", inverse)
     return weight @ ((within + change**2) / size**2) / weight.sum()
 
 
