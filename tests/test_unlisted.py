@@ -280,11 +280,12 @@ def test_a_thermometer_is_smoothed_where_its_noise_is_its_own_alone(rng: np.rand
         measured = log(0.5 + 0.01 * (inside if own else noisy), rng, temperature=noisy)
         found = gm.diagnose(measured, gm.model_from_effects(["bias"]), hold_out=False)
         [cause] = [c for c in found.causes if c.effect == "bias_temperature"]
-        more += len(found.causes) > 1
+        more += found.verdict == "named" and len(found.causes) > 1
         smoothed = any("smoothed" in line for line in found.findings)
         told[own] += smoothed
-        (slope,) = cause.parameters
-        assert abs(slope.value - 0.01) < 5.0 * slope.std
+        # Where a curve does as well, that has the sizes.
+        for slope in cause.parameters:
+            assert abs(slope.value - 0.01) < 5.0 * slope.std
     assert binom.cdf(told[True], 8, 0.75) > 1e-3
     assert binom.sf(told[False] - 1, 4, 0.1) > 1e-3
     assert binom.sf(more - 1, 12, 0.01) > 1e-3, "a second cause"
