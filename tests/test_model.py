@@ -224,12 +224,13 @@ def truth(noise: dict[str, float]) -> GyroModel:
 
 
 @pytest.mark.long
-def test_fit_of_a_simulation_covers_its_parameters(rng: np.random.Generator):
+@pytest.mark.parametrize(("flicker", "bias"), [(2e-9, 0.95), (4e-10, 0.88)])
+def test_fit_of_a_simulation_covers_its_parameters(flicker: float, bias: float, rng: np.random.Generator):
     """Counts of 4e6 next to 1e-9 rad/s, no start values, noise of three kinds estimated alongside.
 
-    The flicker shows in most draws; docs/decisions.md says what the bias's interval covers where it hardly does.
+    Where flicker hardly shows, a bias is covered less often than its 95 % say: docs/decisions.md.
     """
-    model = truth({"noise_white": 5e-9, "noise_flicker": 2e-9, "noise_random_walk": 4e-12})
+    model = truth({"noise_white": 5e-9, "noise_flicker": flicker, "noise_random_walk": 4e-12})
     measured = campaign(rng, "count/s")
     record = read_signals(measured)
     exact = simulate(GyroModel(model.effects), measured).columns["output"]
@@ -242,7 +243,7 @@ def test_fit_of_a_simulation_covers_its_parameters(rng: np.random.Generator):
         inside += np.abs(error) < norm.isf(0.025) * estimate.std
         assert error[0] / 4e6 == pytest.approx(0.0, abs=1e-8)
         assert error[1] == pytest.approx(0.0, abs=4e-8)
-    assert (binom.cdf(inside, SEEDS, 0.95) > RARE).all(), inside
+    assert (binom.cdf(inside, SEEDS, [0.95, bias, 0.95, 0.95]) > RARE).all(), inside
 
 
 def test_a_bias_is_less_certain_where_noise_may_be_slow(rng: np.random.Generator):

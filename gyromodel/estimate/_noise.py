@@ -210,7 +210,8 @@ def _variances(gram: np.ndarray, weight: np.ndarray, samples: int) -> np.ndarray
     """Of the parameters, over noise cells of such weights: the mean in a cell, and of the squared change to it."""
     p = gram.shape[1] - 1
     size = np.sqrt(np.einsum("gii->gi", gram[:, :p, :p]))
-    inverse = np.linalg.inv(gram[:, :p, :p] / (size[:, :, None] * size[:, None, :]))
+    # The least that double precision leaves of directions, as the likelihood has it.
+    inverse = np.linalg.inv(gram[:, :p, :p] / (size[:, :, None] * size[:, None, :]) + 1e-13 * np.eye(p))
     change = np.einsum("gij,gj->gi", inverse, gram[:, :p, p] / size)
     residual_sum = gram[:, p, p] - np.einsum("gi,gi->g", change, gram[:, :p, p] / size)
     within = np.maximum(residual_sum, 0.0)[:, None] / (samples - p) * np.einsum("gii->gi", inverse)
