@@ -205,7 +205,8 @@ def fog_closed_loop_ramp(folder: Path) -> list[str]:
         ("bias, the codes' error and twice the mains, whose phase is read from the line at 50 Hz in these 80 s", mains),
     )
     rows = [[label, f"{1e9 * rest.std():.0f}"] for label, rest in steps]
-    said = f"`diagnose`: {causes(result)}; {seconds:.0f} s."
+    said, gain = f"`diagnose`: {causes(result)}; {seconds:.0f} s.", result["gain"]
+    said += f" Held out, the search repeated: {gain['before']:.0f} → {gain['after']:.0f} {gain['unit']}."
     code = next((c for c in result["causes"] if c["effect"] == "bias_readout_code"), None)
     period = next((p for p in code["parameters"] if p["name"] == "period"), None) if code else None
     if period:
