@@ -466,13 +466,18 @@ def columns_and_slopes(effect: Effect, rates: jax.Array) -> tuple[jax.Array, jax
 
 
 @pytest.mark.parametrize(("low", "high"), [(-1.5, 1.5), (-1.5, 0.0), (0.2, 2.0), (-2.0, -0.5)])
-@pytest.mark.parametrize("knots", [5, 7])
-def test_spline_columns_are_natural_cubic_splines(low: float, high: float, knots: int, rng: np.random.Generator):
+@pytest.mark.parametrize("moved", [(), (20, -45, 3), (-10, 49, -30, 0, 15)])
+def test_spline_columns_are_natural_cubic_splines(
+    low: float, high: float, moved: tuple[int, ...], rng: np.random.Generator
+):
     """A natural spline is given by its values at the knots: scipy's through the same values is the same curve."""
-    places, inside = np.linspace(low, high, knots), rng.uniform(low, high, ROWS - knots - 5)
+    knots = len(moved or range(5)) + 2
+    places = np.linspace(low, high, knots)
+    places[1:-1] += np.array(moved or [0] * (knots - 2)) / 100 * (places[1] - places[0])
+    inside = rng.uniform(low, high, ROWS - knots - 5)
     beyond = np.array([low - 2.0, low - 1.0, high + 1.0, high + 2.0])
     rates = jnp.asarray(np.concatenate([places, inside, beyond, [0.0]]))
-    effect = ScaleSpline(knots=knots).prepared({"rate": jnp.asarray(places)})
+    effect = ScaleSpline(knots=knots, moved=moved).prepared({"rate": jnp.asarray(places)})
     columns, slopes = (np.asarray(x) for x in columns_and_slopes(effect, rates))
     assert np.linalg.matrix_rank(np.column_stack([columns[:knots], np.ones(knots), places])) == knots
     scipy_spline = CubicSpline(places, columns[:knots], bc_type="natural")
@@ -520,6 +525,8 @@ def test_prepared_keeps_what_is_set(rng: np.random.Generator):
         (ScaleNonlinearity, {"powers": (2, 3), "coefficients": jnp.zeros(3)}),
         (ScaleSpline, {"knots": 2}),
         (ScaleSpline, {"knots": 6, "coefficients": jnp.zeros(3)}),
+        (ScaleSpline, {"knots": 6, "moved": (10, 20, 30)}),
+        (ScaleSpline, {"knots": 5, "moved": (10, -50, 30)}),
         (BiasTemperatureCurve, {"hinges": jnp.zeros(2), "breakpoints": jnp.zeros(1)}),
         (BiasTemperatureCurve, {"coefficients": jnp.zeros(0)}),
         (BiasTemperatureCurve, {"coefficients": jnp.zeros(())}),

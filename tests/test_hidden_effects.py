@@ -129,6 +129,14 @@ def test_a_wave_of_the_curve_over_rate_is_a_spline():
     assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["scale_spline"])
 
 
+@pytest.mark.long
+def test_a_spline_whose_knots_are_not_even_has_its_name():
+    """Of ten draws at ten times the detectable size one may be a polynomial or unknown; with even knots two were."""
+    drawn = [c for c in study.other_cases(512, EXAMPLE, 10.0) if c.effect == "scale_spline"][:10]
+    answers = [study.run_case(c).answer for c in drawn]
+    assert sum(a is not None and (a.verdict, a.causes) == ("named", ("scale_spline",)) for a in answers) >= 9
+
+
 def test_a_sensor_holds_its_case_back():
     """Heat is kept: in a closed box, case and sensor end at their common temperature; on a ramp the sensor lags."""
     time = np.arange(0.0, 6000.0, 2.0)

@@ -191,7 +191,7 @@ def test_any_numbers_survive_bit_for_bit(tmp_path: Path, numbers: list[float], p
             BiasTemperatureCurve(
                 coefficients=jnp.stack([b, c]), hinges=jnp.stack([d]), breakpoints=jnp.stack([e]), reference=f
             ),
-            ScaleSpline(coefficients=jnp.stack([a, b, c, d]), full_rate=e, lowest=f),
+            ScaleSpline(coefficients=jnp.stack([a, b, c, d]), moved=(0, -12, 30, 7), full_rate=e, lowest=f),
             BiasColumn(coefficient=g, column="supply_voltage", unit="deg/h/V"),
         ),
         dict(zip(("noise_white", "noise_flicker", "noise_random_walk"), positive[1:], strict=True)),
@@ -390,6 +390,7 @@ BAD = [
     (entry("{effect: scale_spline, knots: 2}"), 4, "scale_spline: "),
     (entry("{effect: scale_spline, knots: 1000000000}"), 4, "whole numbers below 1000"),
     (entry("{effect: scale_spline, knots: 6.5}"), 4, "whole numbers"),
+    (entry("{effect: scale_spline, knots: 5, moved: [60, 0, 0]}"), 4, "less than 50 hundredths"),
     ("effects:\n  - {effect: bias_step, fixed: true}\n  - effect: bias_step\n", 3, "of several bias_step all have"),
     ("effects: []\nnoise: loud\n", 2, "noise is"),
     ("effects: []\nnoise: []\n", 2, "needs a noise_white above zero"),

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import jax
 import numpy as np
 
 from gyromodel.diagnosis._forms import addition, not_known
@@ -17,6 +18,7 @@ from gyromodel.effects import Effect
 from gyromodel.estimate import Estimate, EstimateError, fit_record
 from gyromodel.model import GyroModel
 from gyromodel.noise import NoiseRatios
+from gyromodel.signals import Record
 
 NoisePath = Sequence[NoiseRatios]
 
@@ -86,12 +88,14 @@ class Steps:
         baseline: the fitted simulation.
         threshold: least ln evidence ratio of an addition.
         noise: ratios to hold in the fits, by the number of additions (the last for more); none: estimate them.
+        fits: what has been fitted, as the choices of a search meet again.
     """
 
     scanner: Scanner = field(repr=False)
     baseline: Estimate
     threshold: float
     noise: NoisePath = ()
+    fits: dict[Hashable, Estimate | None] = field(default_factory=dict, repr=False, compare=False)
 
     def fit(self, found: Sequence[Found]) -> Estimate | None:
         """The simulation with everything found; shapes that cannot be estimated stay at the searched value.
@@ -116,6 +120,15 @@ class Steps:
             # Another solver would be compiled anew for each model, and has rescued none that this one lost.
             "solver": "levenberg_marquardt",
         }
+        leaves, form = jax.tree_util.tree_flatten((model, ratios, start))
+        values = tuple(np.asarray(leaf).tobytes() for leaf in leaves)
+        key = (form, values, rows, how["markov"], frozenset(f.name for f in found if f.effect))
+        if key not in self.fits:
+            self.fits[key] = self._fitted(data, model, found, how)
+        return self.fits[key]
+
+    def _fitted(self, data: Record, model: GyroModel, found: Sequence[Found], how: dict[str, Any]) -> Estimate | None:
+        """See `fit`."""
         entangled, lost, searched = None, 0, _shapes_held(model, found)
         attempts = (model,) if searched.fixed == model.fixed else (model, searched)
         for attempt in attempts:

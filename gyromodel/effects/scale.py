@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from typing import Self
 
 import equinox as eqx
@@ -13,6 +14,10 @@ from jaxtyping import Array, Float
 
 from gyromodel.effects._base import EVERY_GYRO, Effect, Signals, parameter, setting, stack
 from gyromodel.effects._shapes import EARTHLY, OverTemperature, beyond_earth, check_curve, curve_columns, curve_forms
+
+# Splines are searched with even knots, and in so many ways with inner knots moved by up to so many hundredths of their
+# distance.
+UNEVEN, MOVED = 8, 30
 
 
 class ScaleFactor(Effect):
@@ -294,6 +299,7 @@ class ScaleSpline(Effect):
 
     coefficients: Float[Array, " bend"] = parameter("ppm", 100.0, "bends, as parts of the largest rate", default=())
     knots: int = eqx.field(static=True, default=6)
+    moved: tuple[int, ...] = eqx.field(static=True, default=())
     full_rate: Float[Array, ""] = setting()
     lowest: Float[Array, ""] = setting()
 
@@ -304,26 +310,18 @@ class ScaleSpline(Effect):
     def __check_init__(self) -> None:
         if self.knots < 3 or self.coefficients.shape != (self.knots - 2,):
             raise ValueError("a spline of n knots, three or more, has n - 2 coefficients")
+        if self.moved and (len(self.moved) != self.knots - 2 or np.abs(self.moved).max() >= 50):
+            raise ValueError("each knot between the outer two is moved by less than 50 hundredths of their distance")
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """Truncated cubes that are straight outside the outer knots, less their tangent at rest.
 
-        Knots are even from `lowest` to `full_rate`; with value and slope zero at rest, bias and scale factor keep their
-        meaning.
+        Knots are even from `lowest` to `full_rate`, but for what inner ones are `moved` by, in hundredths of their
+        distance; with value and slope zero at rest, bias and scale factor keep their meaning.
         """
-        places = jnp.linspace(0.0, 1.0, self.knots)
-        width = self.full_rate - self.lowest
-
-        def bends(u):
-            cube = jnp.maximum(u[..., None] - places, 0.0) ** 3
-            part = (cube[..., :-1] - cube[..., -1:]) / (1.0 - places[:-1])
-            return part[..., :-1] - part[..., -1:]
-
-        rest = -self.lowest / width
-        value, slope = jax.jvp(bends, (rest,), (jnp.ones(()),))
-        rate = signals["rate"]
-        top = jnp.maximum(jnp.abs(self.full_rate), jnp.abs(self.lowest))
-        return (bends((rate - self.lowest) / width) - value - slope * rate[:, None] / width) * top
+        places = np.linspace(0.0, 1.0, self.knots)
+        places[1:-1] += np.divide(self.moved or 0, 100 * (self.knots - 1))
+        return _bends(signals["rate"], self.full_rate, self.lowest, places)
 
     def prepared(self, signals: Signals) -> Self:
         """Spread the knots over the campaign's rates."""
@@ -334,6 +332,30 @@ class ScaleSpline(Effect):
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
-        """Smooth curves of five to seven knots, where there are rates enough."""
+        """Smooth curves of five to seven knots, even and not, where there are rates enough."""
+        if not beyond_earth(signals):
+            return []
         levels = len(np.unique(np.round(np.asarray(signals["rate"]), 9)))
-        return [cls(knots=k).prepared(signals) for k in (5, 6, 7) if levels >= 2 * k and beyond_earth(signals)]
+        able = [cls(knots=k).prepared(signals) for k in (5, 6, 7) if levels >= 2 * k]
+        return [replace(e, moved=moved) for e in able for moved in ((), *_moves(e.knots - 2))]
+
+
+def _moves(count: int) -> list[tuple[int, ...]]:
+    """Ways of moving so many knots."""
+    return [tuple(map(int, row)) for row in np.random.default_rng(0).integers(-MOVED, MOVED, (UNEVEN, count))]
+
+
+@jax.jit
+def _bends(rate: Array, full_rate: Array, lowest: Array, places: Array) -> Array:
+    """`ScaleSpline.columns`, compiled as one."""
+    width = full_rate - lowest
+
+    def bends(u):
+        cube = jnp.maximum(u[..., None] - places, 0.0) ** 3
+        part = (cube[..., :-1] - cube[..., -1:]) / (1.0 - places[:-1])
+        return part[..., :-1] - part[..., -1:]
+
+    rest = -lowest / width
+    value, slope = jax.jvp(bends, (rest,), (jnp.ones(()),))
+    top = jnp.maximum(jnp.abs(full_rate), jnp.abs(lowest))
+    return (bends((rate - lowest) / width) - value - slope * rate[:, None] / width) * top
