@@ -682,6 +682,11 @@ def test_a_pair_of_columns_is_a_driver_too(rng: np.random.Generator, tmp_path: P
     assert panels(diagnosis)[:2] == [("residual-temperature", True), ("residual-rate", True)]
     [drawn] = figures(diagnosis).driver
     assert "depends on more than rate," in drawn.caption
+    assert drawn.caption.endswith("bars: two standard errors.")
+    warm = replace(pair_of, second=np.repeat([-20.0, 0.0, 20.0, 40.0], 20), second_unit="degC")
+    [drawn] = figures(replace(diagnosis, driver=warm)).driver
+    assert "in parts by temperature" in drawn.caption
+    assert re.findall(r">(\S+ °C)<", drawn.svg) == ["−20.0 °C", "0 °C", "20.0 °C", "40.0 °C"]
     assert "Rate and angular acceleration" in words(write_report(diagnosis, tmp_path)[0])
     turning = replace(diagnosis, driver=replace(pair_of, column="rate and d(rate)/dt"))
     assert "follows rate and angular acceleration and matches" in sentence(turning)

@@ -107,7 +107,7 @@ class Driver:
     `column` is a column a, d(a)/dt (its rate of change) or a[earlier] (its value some time before, of the rate its root
     mean square, which warms a torquer); rate[behind] is the rate some time before, less the rate. `nearest` is the
     catalogue effect that comes closest, `nearest_share` what part of the curve's work it does, `behind` by how many
-    nats of evidence it is beaten.
+    nats of evidence it is beaten. Of a function of two columns, `x` is the first and `second` the other there.
     """
 
     column: str
@@ -119,6 +119,8 @@ class Driver:
     nearest: str = ""
     nearest_share: float = 0.0
     behind: float = 0.0
+    second: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    second_unit: str = ""
 
 
 @dataclass(frozen=True)
@@ -165,6 +167,8 @@ class Diagnosis:
         if self.driver is not None:
             d = self.driver
             shape = {"x": d.x.tolist(), "y": d.y.tolist(), "std": d.std.tolist(), "x_unit": d.unit, "y_unit": d.y_unit}
+            if d.second.size:
+                shape |= {"second": d.second.tolist(), "second_unit": d.second_unit}
             nearest = {"effect": d.nearest, "share": d.nearest_share, "behind": d.behind} if d.nearest else None
             driver = {"column": d.column, "shape": shape, "nearest": nearest}
         return {

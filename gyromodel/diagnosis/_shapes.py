@@ -86,12 +86,18 @@ def driver_shape(scanner: Scanner, selection: Selection, name: str, unit: str) -
     form, explained, _ = ranking.best_form(name)
     along = scanner.bank.blocks[int(np.asarray(form))].along
     assert along is not None
-    file_unit, x = driver_unit(record, smooth_columns(name)[0]), along[: record.rows]
+    first, *others = smooth_columns(name)
+    file_unit, x = driver_unit(record, first), along[: record.rows]
     order = np.argsort(x)[:: max(1, record.rows // 300)]
     scale = factor(record.input_unit, unit)
-    label = " and ".join(smooth_columns(name))
+    label = " and ".join((first, *others))
     found = from_internal(x[order], file_unit), value[order] * scale, std[order] * scale
-    return Driver(label, file_unit, *found, unit, *_nearest(ranking, name, explained))
+    driver = Driver(label, file_unit, *found, unit, *_nearest(ranking, name, explained))
+    second = next((b.along for b in scanner.bank.blocks if others and b.name == f"smooth({others[0]})"), None)
+    if second is None:
+        return driver
+    second_unit = driver_unit(record, others[0])
+    return replace(driver, second=from_internal(second[: record.rows][order], second_unit), second_unit=second_unit)
 
 
 def _nearest(ranking: Ranking, driver: str, explained: float) -> tuple[str, float, float]:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from gyromodel.diagnosis._result import Diagnosis
+    from gyromodel.diagnosis._result import Diagnosis, Driver
 
 # Patterns of the names of all figures.
 FIGURES = ("measured-simulated-*", "residual-*", "driver")
@@ -206,8 +206,21 @@ def _found(diagnosis: Diagnosis, known: dict[str, Abscissa]) -> Drawn:
     first, *more = followed(diagnosis)
     # A response depends on what the rate was before and after as well.
     if more or first in (RATE_OF.format("rate"), BEHIND.format("rate")):
-        axes.plot(x, y / scale, ".", color=draw.AFTER, markersize=4.0, zorder=5, label="function found")
-        caption = f"Points: the function found, which depends on more than {driven(first)}, where it was measured."
+        caption = f"Points: the function found, which depends on more than {driven(first)}, where it was measured"
+        caption += f", in parts by {driven(more[0])}" if driver.second.size else ""
+        caption += "; bars: two standard errors."
+        for rows, colour, name in _parts(driver, more, order):
+            axes.errorbar(
+                x[rows],
+                y[rows] / scale,
+                2.0 * std[rows] / scale,
+                fmt=".",
+                color=colour,
+                markersize=5.0,
+                elinewidth=0.8,
+                zorder=5,
+                label=name,
+            )
     else:
         for width, alpha in ((2.0, 0.16), (1.0, 0.26)):
             lower, upper = (y - width * std) / scale, (y + width * std) / scale
@@ -239,6 +252,21 @@ def _found(diagnosis: Diagnosis, known: dict[str, Abscissa]) -> Drawn:
     reach = f"{number(float(np.nanmin(y)))} to {number(float(np.nanmax(y)))} {unit_text(driver.y_unit)}"
     alt = f"The error of the simulation as a smooth function of {label}, from {reach}."
     return Drawn("driver", f"What the error does over {label}", caption, alt, draw.rendered(figure, "driver"), True)
+
+
+def _parts(driver: Driver, more: list[str], order: np.ndarray) -> list[tuple[np.ndarray, str, str]]:
+    """The points of a driver's function in parts by its second column: which, their colour, and what they are."""
+    if not driver.second.size:
+        return [(np.arange(len(order)), draw.AFTER, "function found")]
+    second = driver.second[order]
+    edges = np.unique(np.quantile(second, np.linspace(0.0, 1.0, len(draw.PARTS) + 1)))
+    part = np.clip(np.searchsorted(edges, second, "right") - 1, 0, max(len(edges) - 2, 0))
+    unit, found = unit_text(driver.second_unit), []
+    for k in np.unique(part):
+        inside = second[part == k]
+        ends = dict.fromkeys(number(float(end), 3).replace("-", "−") for end in (inside.min(), inside.max()))
+        found.append((np.flatnonzero(part == k), draw.PARTS[k], f"{' to '.join(ends)} {unit}".rstrip()))
+    return found
 
 
 def _panel(diagnosis: Diagnosis, x: Abscissa, layers: list[draw.Layer], text: str) -> tuple[Figure, Axes, list[str]]:
