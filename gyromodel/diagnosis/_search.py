@@ -201,10 +201,12 @@ def _lead(steps: Steps, driver: str, path: list[Found], last: Ranking) -> float:
     """By how many nats a driver of the first ranking leads all that was found together.
 
     Names that partly stand for one another add up to more than they explain. Beside a driver that was ahead of the
-    first, several are therefore also weighed as one addition, by what they have explained in the last noise cells.
+    first, several are therefore also weighed as one addition, by what they have explained in the last noise cells. Low
+    odds of a name are odds against other names, and no lead of a driver.
     """
     first, name = path[0].ranking, path[0].name
     lead = first.statistic[driver] - sum(f.ranking.statistic[f.name] for f in path)
+    lead -= sum(max(steps.scanner.bank.price(f.name), 0.0) for f in path)
     if first.statistic[driver] < first.statistic[name] or any(f.frees_noise for f in path):
         return lead
     # On the same data: a driver may follow what a name does not know of.
