@@ -32,6 +32,9 @@ of a gyro, and of a stabilised platform on a vibration table
 
 Parameters stand in the unit that files and reports use. "Typical" is a usual size; an amplitude starts at zero, which
 is exactly the model without the effect. The model is linear in all parameters but those marked *nonlinear*.
+
+A model file states, besides, what shapes an effect and is not fitted: `reference` is the T0, X0, B0 or N0 of an
+equation, the campaign's mean where it is not given; others are explained with their effects.
 """
 
 

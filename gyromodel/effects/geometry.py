@@ -148,7 +148,10 @@ class TableTilt(Effect):
 
 
 class TableHarmonic(Effect):
-    """I += Σ c_k cos kΘ + s_k sin kΘ, Θ the table angle: what returns with each turn of the table."""
+    """I += Σ c_k cos kΘ + s_k sin kΘ, Θ the table angle: what returns with each turn of the table.
+
+    `orders` lists the k.
+    """
 
     id = "table_harmonic"
     site = "rate"

@@ -65,7 +65,10 @@ class ScaleAsymmetry(Effect):
 
 
 class ScaleNonlinearity(Effect):
-    """rate·ε = Σ k_i rate^i, i = 2…5: polynomial output error."""
+    """rate·ε = Σ k_i rate^i, i = 2…5: polynomial output error.
+
+    `powers` lists other i.
+    """
 
     id = "scale_nonlinearity"
     site = "scale"
@@ -284,7 +287,11 @@ class ScaleTemperatureCurve(OverTemperature):
 
 
 class ScaleSpline(Effect):
-    """rate·ε = s(rate), a natural cubic spline with its straight line taken out."""
+    """rate·ε = s(rate), a natural cubic spline with its straight line taken out.
+
+    It has so many `knots`, evenly from `lowest` to `full_rate`, but for what inner ones are `moved` by, in hundredths
+    of their distance.
+    """
 
     id = "scale_spline"
     site = "rate"
