@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 INK, MUTED, GRID, PAPER = "#1f2a37", "#5b6675", "#e4e8ee", "#ffffff"
 BEFORE, BEFORE_DOT, AFTER, AFTER_DOT, MARK = "#6b7686", "#b9c1cc", "#1463b8", "#8dbbe9", "#b93a0b"
 # Parts of a set of points, from the least to the greatest; seen on light and on dark.
-PARTS = ("#2f74c0", "#2aa198", "#d08a1c", "#c8402f")
+PARTS = ("#2f74c0", "#2aa198", "#c27f16", "#c8402f")
 # Style-sheet variables that replace the colours inside the page, so that figures follow its light or dark theme.
 VARIABLES = {
     INK: "--ink",
