@@ -35,6 +35,11 @@ is exactly the model without the effect. The model is linear in all parameters b
 
 A model file states, besides, what shapes an effect and is not fitted: `reference` is the T0, X0, B0 or N0 of an
 equation, the campaign's mean where it is not given; others are explained with their effects.
+
+Scale terms multiply the bias as they do the rate. Of an analog gyro whose output at rest is a null voltage, many deg/s
+as a bias, a scale factor that changes with temperature therefore moves the output at rest too, and `bias_temperature`
+is what that leaves, if need be of the other sign. Take the null voltage from the output first where the two are to be
+told apart.
 """
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from scipy.interpolate import CubicSpline
 
@@ -16,6 +18,8 @@ MAXIMUM_ROWS = 20_000
 MOST_TURN = 30.0
 # Rates from an attitude err by its noise and its smoothing at high frequencies; their means over so long (s) hardly do.
 MEAN_OF_ATTITUDE = 0.2
+# Part of a corner's change of slope that those at the two rows before it, or at the two behind, stay below.
+STRAIGHT = 0.1
 
 
 def average(campaign: Campaign, maximum: int = MAXIMUM_ROWS, seconds: float = 0.0) -> tuple[Campaign, int]:
@@ -99,8 +103,8 @@ def as_rate(campaign: Campaign) -> Campaign:
 def with_interval_rates(campaign: Campaign) -> Campaign:
     """The campaign with its output as a rate, and reference rates as their means over the interval before each row.
 
-    The means are those of a cubic spline through the rates. In the first row and behind gaps none is known, and the
-    output is left out.
+    The means are those of cubic splines through the rates, from corner to corner of these. In the first row and behind
+    gaps none is known, and the output is left out.
     """
     campaign = as_rate(campaign)
     time, step = campaign.columns["time"], np.diff(campaign.columns["time"], prepend=np.nan)
@@ -108,8 +112,27 @@ def with_interval_rates(campaign: Campaign) -> Campaign:
     for name in campaign.covariates:
         values = campaign.columns[name]
         if name.partition("_")[0] == "rate" and np.isfinite(values).all():
-            turned = CubicSpline(time, values).antiderivative()(time)
-            means = np.where(unknown, values, np.diff(turned, prepend=np.nan) / step)
+            means = np.where(unknown, values, _turned(time, values) / step)
             campaign = campaign.with_column(name, means, campaign.units[name])
     output = np.where(unknown, np.nan, campaign.columns["output"])
     return campaign.with_column("output", output, campaign.units["output"])
+
+
+def _turned(time: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    """What a rate has turned since the row before; nothing is known of the first.
+
+    A cubic spline through a corner, where a table changes its acceleration at once, would be wrong on both sides of it.
+    """
+    turned = np.full(len(time), np.nan)
+    for begin, end in pairwise([0, *_corners(time, rate), len(time) - 1]):
+        part = slice(begin, end + 1)
+        turned[begin + 1 : end + 1] = np.diff(CubicSpline(time[part], rate[part]).antiderivative()(time[part]))
+    return turned
+
+
+def _corners(time: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    """Rows where a straight course of the rate begins or ends: its slope changes there, and not at the two beyond."""
+    change = np.abs(np.diff(np.diff(rate) / np.diff(time)))
+    inner = change[2:-2]
+    before, after = (np.maximum(change[k : len(change) - 4 + k], change[k + 1 : len(change) - 3 + k]) for k in (0, 3))
+    return 3 + np.flatnonzero(np.minimum(before, after) < STRAIGHT * inner)

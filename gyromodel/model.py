@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import replace
 from difflib import get_close_matches
 from typing import Any, NamedTuple
@@ -262,16 +262,25 @@ class GyroModel(eqx.Module):
         slope = jax.jvp(lambda r: self.predict({**signals, "rate": r}), (rate,), (jnp.ones_like(rate),))[1]
         return jnp.where(jnp.abs(slope) < DEAD * jnp.abs(self.gain()), self.gain(), slope)
 
-    def columns_of(self, effect: Effect, signals: Signals) -> Float[Array, "sample coefficient"]:
-        """Derivative of the output by an effect's linear coefficients, as it stands in this model or were it added."""
+    def columns_at(self, signals: Signals) -> Callable[..., Float[Array | np.ndarray, "sample coefficient"]]:
+        """What gives an effect's columns: the output's derivative by its linear coefficients, in this model or added.
+
+        In NumPy where nothing is traced; of an effect that is to see only some signals, these are given beside it.
+        """
         gain, rate, scale = self._sites(signals)
         before = rate * scale
-        if effect.site == "gain":
-            return (self.told(before, signals) * gain / effect.value)[:, None]  # type: ignore[attr-defined]
-        if effect.site == "output":
-            return gain * effect.columns({**signals, "rate": before})
-        weight = gain * self.passed(before, signals) * (scale if effect.site in ADDED else rate)
-        return weight[:, None] * effect.columns(signals)
+        passed = gain * self.passed(before, signals)
+        told, added, scaled = (on_host(x) for x in (gain * self.told(before, signals), passed * scale, passed * rate))
+
+        def columns(effect: Effect, seen: Signals = signals) -> Float[Array | np.ndarray, "sample coefficient"]:
+            if effect.site == "gain":
+                return (told / on_host(effect.value))[:, None]  # type: ignore[attr-defined]
+            if effect.site == "output":
+                return on_host(gain) * on_host(effect.columns({**seen, "rate": before}))
+            weight = added if effect.site in ADDED else scaled
+            return weight[:, None] * on_host(effect.columns(seen))
+
+        return columns
 
     def steady_columns(self, signals: Signals) -> dict[int, np.ndarray]:
         """Columns that no parameter changes, by the place of their effect in the model."""

@@ -63,3 +63,23 @@ def test_rates_over_intervals_are_what_an_angle_has_turned():
     assert of.columns["rate"][known] == pytest.approx(np.diff(angle, prepend=0.0)[known] / 0.01, abs=2e-6)
     assert np.abs(rate - of.columns["rate"])[known].max() > 0.1
     assert (of.columns["temperature"] == rate).all()
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.3])
+def test_rates_over_intervals_know_the_corners_of_a_table(shift: float):
+    """Of ramps between constant rates, whose corners are rows or lie between; the integral by hand."""
+    time = np.arange(200.0)
+    corners = shift + np.array([0.0, 20.0, 25.0, 50.0, 55.0, 80.0, 90.0, 120.0, 121.0, 150.0])
+    rates = np.array([0.0, 0.0, 10.0, 10.0, -5.0, -5.0, 5.0, 5.0, 0.0, 0.0])
+    fine = np.linspace(0.0, 199.0, 199_001)
+    course = np.interp(fine, corners, rates)
+    angle = np.concatenate([[0.0], np.cumsum(0.5e-3 * (course[1:] + course[:-1]))])[::1000]
+    columns = {"time": time, "rate": np.interp(time, corners, rates), "output": np.diff(angle, prepend=0.0)}
+    of = with_interval_rates(Campaign(columns, {"time": "s", "rate": "deg/s", "output": "deg"}, {"kind": "increment"}))
+    off = np.abs(of.columns["rate"] - np.diff(angle, prepend=0.0))[1:]
+    if shift:
+        # A corner between two rows is not known: only there is the mean off, by an eighth of the change of slope or so.
+        assert (off > 0.03).sum() <= 2 * (len(corners) - 1)
+        assert off.max() < 5.0 / 8.0 + 0.1
+    else:
+        assert off.max() < 1e-9

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -15,6 +14,7 @@ from gyromodel.diagnosis._smooths import products, smooths
 from gyromodel.effects import CATALOGUE, Effect, Signals
 from gyromodel.effects._base import lacking
 from gyromodel.effects.drivers import BiasColumn
+from gyromodel.model import GyroModel
 from gyromodel.signals import Record
 
 # Columns whose linear effect on the bias is in the catalogue, is the scale factor, or means nothing.
@@ -40,6 +40,7 @@ OWNERS = (
 )
 # Before the name of an effect that is searched, but not in all its forms.
 PART_OF = "part of "
+NOTHING_KNOWN = GyroModel(())
 
 
 @dataclass(frozen=True)
@@ -115,6 +116,16 @@ class BlockTable:
         self._blocks = [b.name for b in bank.blocks]
         self._widths = np.array([b.width for b in bank.blocks], int)
         self._grown = np.array([b.effect is not None and b.effect.grown for b in bank.blocks])
+        self._scaled = np.array([b.effect is not None and b.effect.site == "scale" for b in bank.blocks], bool)
+
+    def most(self, contained: dict[str, int]) -> np.ndarray:
+        """How many columns of each block can be left: of scale terms, those that a baseline does not have.
+
+        What scale terms multiply differs a little from the bank's, as all that was found has moved the bias: the
+        difference is a bias, and nothing of the scale factor.
+        """
+        spare = np.array([contained.get(name, 0) for name in self._blocks])
+        return np.where(self._scaled, np.maximum(self._widths - spare, 0), self._widths)
 
     def least(self, contained: dict[str, int]) -> np.ndarray:
         """How many columns of each block must be left beside a baseline that has so many of a name's."""
@@ -133,13 +144,17 @@ def _is_owned(record: Record, name: str) -> bool:
     return name in OWN_EFFECTS or (name in OWNERS and of_usual_unit(name, record.units[name]))
 
 
-def build_bank(record: Record) -> Bank:
-    """Lay out the search for a record."""
+def build_bank(record: Record, model: GyroModel = NOTHING_KNOWN) -> Bank:
+    """Lay out the search for a record: columns of extensions of a fitted model, at zero amplitude, as input rates."""
     signals = _usable(record)
+    of, gain = model.columns_at(record.signals), float(model.gain())
+
+    def columns(effect: Effect, seen: Signals) -> np.ndarray:
+        return np.asarray(of(effect, seen)) / gain
+
     blocks: list[tuple[str, Literal["effect", "driver"], np.ndarray, Effect | None]] = []
     not_testable: dict[str, str] = {}
     scans = []
-    rate = np.asarray(signals.get("rate", jnp.zeros_like(signals["time"])))
     for name, kind in sorted(CATALOGUE.items()):
         if kind.domain != record.domain:
             continue
@@ -162,7 +177,7 @@ def build_bank(record: Record) -> Bank:
                 not_testable[name] = kind.untested
             elif part := kind.hidden(signals):
                 not_testable[PART_OF + name] = part
-            blocks.extend((name, "effect", _weighted(e, signals, rate), e) for e in forms)
+            blocks.extend((name, "effect", columns(e, signals), e) for e in forms)
     # A column of a platform's test is part of its motion, in proportion to which the angle errs by other names.
     linear = record.domain == "gyro"
     for name in record.signals:
@@ -173,7 +188,7 @@ def build_bank(record: Record) -> Bank:
             )
     for name in [n for n in driver_names(record) if linear and not _is_owned(record, n)]:
         effect = BiasColumn(column=name).prepared(record.signals)
-        blocks.append((effect.label, "effect", _weighted(effect, record.signals, rate), effect))
+        blocks.append((effect.label, "effect", columns(effect, record.signals), effect))
     along = {}
     for name, values, shape in smooths(record):
         along[len(blocks)] = values
@@ -202,8 +217,8 @@ def build_bank(record: Record) -> Bank:
             )
         )
         start += shape.shape[1]
-    columns = np.concatenate([blocks[i][2] for i in order], axis=1) if blocks else np.zeros((len(rate), 0))
-    return Bank(columns, tuple(laid), tuple(scans), not_testable)
+    laid_out = np.concatenate([blocks[i][2] for i in order], axis=1) if blocks else np.zeros((len(signals["time"]), 0))
+    return Bank(laid_out, tuple(laid), tuple(scans), not_testable)
 
 
 def _structure(name: str, effect: Effect | None, width: int) -> str:
@@ -221,11 +236,3 @@ def _missing(kind: type[Effect], record: Record, usable: Signals) -> str:
         if reasons and all(reasons):
             return " and ".join(reasons)
     return ""
-
-
-def _weighted(effect: Effect, signals: Signals, rate: np.ndarray) -> np.ndarray:
-    """The extension's derivative at zero amplitude, as an input rate."""
-    if effect.site == "gain":
-        return rate[:, None]
-    columns = np.asarray(effect.columns(signals))
-    return columns * rate[:, None] if effect.site == "scale" else columns

@@ -11,12 +11,13 @@ from gyromodel.diagnosis._extended import finished, stated_counts, stated_hops, 
 from gyromodel.diagnosis._isolation import settling_test
 from gyromodel.diagnosis._judgement import Judgement, structured, undecided, with_noise, with_steps
 from gyromodel.diagnosis._misfit import excess_band
+from gyromodel.diagnosis._next_tests import test_of_driver
 from gyromodel.diagnosis._noise_causes import quantisation
 from gyromodel.diagnosis._points import dwells_apart
 from gyromodel.diagnosis._searches import Searched, with_noise_estimated
 from gyromodel.diagnosis._unseen import held_back
 from gyromodel.diagnosis._variance import noise_level, tails
-from gyromodel.diagnosis._verdict import FAINT, judge, test_of_driver
+from gyromodel.diagnosis._verdict import FAINT, judge
 from gyromodel.estimate import Estimate, with_reading
 from gyromodel.model import effect_class
 
@@ -153,5 +154,6 @@ def _in_doubt(found: Searched, judgement: Judgement, baseline: Estimate, extende
         found.findings.append(TURNED_ON)
         judgement = undecided(judgement, "bias_warmup", found.instead, TELL_RUNS)
     if (rival := found.selection.rival) and judgement.causes:
-        judgement = undecided(judgement, judgement.causes[0].effect, rival, test_of_driver(rival))
+        strongest = max(judgement.causes, key=lambda c: (c.effect != "outliers", c.statistic))
+        judgement = undecided(judgement, strongest.effect, rival, test_of_driver(rival))
     return judgement

@@ -195,7 +195,7 @@ def _solved(scanner: Scanner, estimate: Estimate, effect: Effect, g: int, pulses
     model = replace(model, effects=tuple(e for e in model.effects if e.label not in effect.supersedes), noise={})
     if effect.site == "gain":
         return effect
-    columns = model.columns_of(effect, scanner.record.signals)
+    columns = model.columns_at(scanner.record.signals)(effect)
     return effect.with_linear(_coefficients(scanner, model, columns, g, pulses))
 
 

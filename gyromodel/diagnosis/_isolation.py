@@ -63,7 +63,7 @@ class View:
 
     def columns_of(self, effects: Sequence[Effect], *, whole: bool = False) -> list[np.ndarray]:
         """What is left of the columns of each effect; or all of them."""
-        each = [np.asarray(self.model.columns_of(e, self.record.signals)) for e in effects]
+        each = list(map(self.model.columns_at(self.record.signals), effects))
         ends = np.cumsum([c.shape[1] for c in each])[:-1]
         columns = np.concatenate(each, axis=1)
         return np.split(self._whitened(columns) if whole else self.rest(columns), ends, axis=1)
@@ -323,7 +323,7 @@ def _sizes(campaigns: Sequence[Campaign], model: GyroModel) -> Isolability:
     ratios = given_ratios(record, model)
     assert ratios is not None
     std = float(model.noise["noise_white"]) / np.sqrt(record.interval) * abs(float(model.gain()))
-    view, bank, have = View(record, model, ratios, std), build_bank(record), skipped(model, record.signals)
+    view, bank, have = View(record, model, ratios, std), build_bank(record, model), skipped(model, record.signals)
     forms: dict[str, list[Effect]] = {}
     for block in bank.blocks:
         if block.effect is not None and block.name not in have:

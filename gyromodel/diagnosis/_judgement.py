@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gyromodel.diagnosis._ranking import Ranking, is_driver
+from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise
 from gyromodel.diagnosis._result import Cause, Verdict
 
 
@@ -92,9 +92,11 @@ def with_noise(judgement: Judgement, beyond: Sequence[Cause], trials: int) -> Ju
 
 def also_held(name: str, members: Iterable[str]) -> str:
     """What is said of a further cause that is in doubt with others."""
+    members = list(members)
+    again = " Repeat the run: noise does not come back." if any(map(is_noise, members)) else ""
     return (
         f"The extended model also holds {name}, which this campaign cannot tell from the others of: "
-        f"{' or '.join(members)}."
+        f"{' or '.join(members)}.{again}"
     )
 
 

@@ -63,6 +63,7 @@ class Beside:
         cross: inner products of the candidates' columns with z.
         barred: lines that are not searched.
         suspected: the rows of each point that may be anomalous in any of the data.
+        most: how many columns of each block can be left.
     """
 
     def __init__(
@@ -74,9 +75,10 @@ class Beside:
         cross: np.ndarray,
         barred: np.ndarray,
         suspected: Sequence[np.ndarray],
+        most: np.ndarray,
     ) -> None:
         self.scanner, self.g, self.cell, self._barred = scanner, g, scanner.cells[g], barred
-        self.suspected = suspected
+        self.suspected, self._most = suspected, most
         against = x.T @ z
         norm = np.sqrt(np.maximum(np.diag(against), 1e-300))
         scaled = against / np.outer(norm, norm) + 1e-13 * np.eye(len(norm))
@@ -97,7 +99,7 @@ class Beside:
             # A column that is nothing beside the others of its block has no direction.
             norm = np.sqrt(np.where(square > NOTHING * square.max(axis=1, keepdims=True), square, np.inf))
             values, vectors = np.linalg.eigh((own - c @ c.transpose(0, 2, 1)) / (norm[:, :, None] * norm[:, None, :]))
-            keep = values > VANISHED
+            keep = (values > VANISHED) & (np.arange(q) >= q - self._most[blocks, None])
             turn = vectors / norm[:, :, None] * np.where(keep, np.where(keep, values, 1.0) ** -0.5, 0.0)[:, None, :]
             left = keep.sum(axis=1)
             energy = np.sum(values * keep, axis=1) / np.maximum(left, 1) * np.mean(square, axis=1)

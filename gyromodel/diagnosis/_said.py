@@ -10,16 +10,18 @@ from scipy.stats import binom
 from gyromodel._checks import listed
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._drivers import RECOVERY_DRIVER
+from gyromodel.diagnosis._evidence import log_sum
 from gyromodel.diagnosis._lines import lines_of
-from gyromodel.diagnosis._ranking import is_driver, special_cases
+from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise, special_cases
 from gyromodel.diagnosis._result import CREDIBLE, VAGUE
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._selection import Selection
 from gyromodel.diagnosis._smooths import recoveries
 from gyromodel.diagnosis._steps import Found, Steps
 from gyromodel.effects import Effect
+from gyromodel.effects.acceleration import BiasAccelerationSquared
 from gyromodel.effects.drivers import BiasPeriodic, BiasStep
-from gyromodel.effects.geometry import TableHarmonic
+from gyromodel.effects.geometry import Misalignment, TableHarmonic
 from gyromodel.effects.thermometer import TemperatureLag
 from gyromodel.estimate import Estimate
 
@@ -31,6 +33,8 @@ UNDER_EARTH = ("bias_acceleration_input", "bias_acceleration_output", "bias_acce
 ROWS_TOLD = 12
 # By how much the lags searched are apart, within which one is known.
 BETWEEN_LAGS = 2.0**0.5
+# By how many nats (ln B) a random walk may lead what it may be instead, names that share what it is, and how many.
+LIKELY, ALIKE, MOST_NAMES = -1.0, 2.0, 3
 # Chance below which they lie right after changes of the rate for a reason.
 BY_CHANCE = 1e-4
 
@@ -57,10 +61,10 @@ def told(
         were = "was" if len(gone) == 1 else "were"
         yield f"{listed(gone)} {were} added on the way, and given up beside what was found."
     for step in (f for f in found if f.rows and not f.points):
-        yield (
-            f"{len(step.rows)} samples next to gaps or the record's ends were left out beside {step.name}: what was "
-            "not recorded still shows there."
+        were = (
+            "samples next to gaps or the record's ends were" if len(step.rows) > 1 else "sample at a gap or an end was"
         )
+        yield f"{len(step.rows)} {were} left out beside {step.name}: what was not recorded still shows there."
     yield from (line for step in found if (line := _in_campaign(step.effect)))
     if any(isinstance(step.effect, BiasPeriodic) for step in found) and (also := _aliases(extended)):
         yield also
@@ -89,6 +93,11 @@ def told_of_cause(steps: Steps, step: Found, extended: Estimate, known: set[str]
     yield from (f"Of thermometer and coil the {part} is late." for part in late)
     orders = [o for e in extended.model.effects if isinstance(e, TableHarmonic) and e.label == name for o in e.orders]
     yield from [f"It returns {listed([str(o) for o in orders])} times a turn of the table."] if orders else []
+    for effect in (e for e in extended.model.effects if e.label == name):
+        if isinstance(effect, Misalignment):
+            yield f"Angles of {name}, in this order: about {listed(effect.about)}."
+        elif isinstance(effect, BiasAccelerationSquared):
+            yield f"Coefficients of {name}, in this order: of {listed(effect.products)}."
     if name in UNDER_EARTH and "rate" not in steps.scanner.record.units:
         yield (
             "No reference rate is given: where the Earth's is in the output, biases from acceleration hold up to 15.04 "
@@ -98,6 +107,31 @@ def told_of_cause(steps: Steps, step: Found, extended: Estimate, known: set[str]
         yield f"Of the evidence for {name}, {odds:.1f} nats are prior odds: every gyro has one."
     if close := _close_rival(step, known):
         yield close
+
+
+def told_of_walk(steps: Steps, last: Ranking) -> Iterator[str]:
+    """A sentence where what was taken for a random walk may be an effect, which the walk keeps from being accepted."""
+    walks, still = ([g for g, walks in last.walks.items() if walks is there] for there in (True, False))
+    if steps.scanner.record.domain != "gyro" or steps.baseline.noise_given or not walks or not still:
+        return
+
+    def weight(cells: Sequence[int], name: str = "") -> float:
+        each = (last.results[g].log_likelihood + last.log_prior[g] for g in cells)
+        own = (last.results[g].evidence.get(name, -np.inf) if name else 0.0 for g in cells)
+        return log_sum([one + other for one, other in zip(each, own, strict=True)])
+
+    walk, nothing = weight(walks), weight(still)
+    effects = [k for k in last.statistic if not (is_driver(k) or is_noise(k) or k == "outliers")]
+    lead = {k: weight(still, k) - walk for k in effects}
+    top = max(lead.values(), default=-np.inf)
+    if not (walk > nothing and top > LIKELY and top + walk - nothing > steps.threshold):
+        return
+    near = {k for k, v in lead.items() if v > top - ALIKE}
+    names = sorted((k for k in near if near.isdisjoint(special_cases(k))), key=lambda k: -lead[k])[:MOST_NAMES]
+    yield (
+        f"What was taken for a random walk of the bias may as well be {' or '.join(names)} (ln B {top:.1f} against the "
+        "walk, which would have to be ruled out): repeat the run, as noise does not come back."
+    )
 
 
 def told_of_rest(selection: Selection, extended: Estimate) -> str:

@@ -179,7 +179,7 @@ class Scanner:
         given_up: Sequence[int] = (),
     ) -> list[Batch]:
         """As `run`, for many residuals of one baseline at once (one a column); cells in the order given."""
-        least = self.table.least(contained)
+        least, most_left = self.table.least(contained), self.table.most(contained)
         stacked = np.column_stack([*(t.column for t in tangents), jacobian, residuals])
         stacked = np.where(self.present[:, None], stacked, 0.0)
         p, first = jacobian.shape[1], len(tangents)
@@ -198,7 +198,7 @@ class Scanner:
 
         def beside(g: int, z: np.ndarray, cross: np.ndarray) -> Beside:
             both = slice(first, first + p)
-            return Beside(self, g, exact[:, both], z[:, both], cross[:, both], barred, suspected)
+            return Beside(self, g, exact[:, both], z[:, both], cross[:, both], barred, suspected, most_left)
 
         def search(group: Sequence[int]) -> list[Batch]:
             found = []

@@ -117,9 +117,8 @@ def laid_out(
         EstimateError: the simulation cannot be fitted.
     """
     baseline = fitted(record, model, start)
-    scanner = Scanner(
-        record, build_bank(record), _grid(record, baseline), outliers=outliers, stated=baseline.noise_given, step=step
-    )
+    bank, grid = build_bank(record, baseline.model), _grid(record, baseline)
+    scanner = Scanner(record, bank, grid, outliers=outliers, stated=baseline.noise_given, step=step)
     safe = safe_threshold(baseline.degrees_of_freedom)
     return Session(scanner, baseline, safe if threshold is None else threshold)
 

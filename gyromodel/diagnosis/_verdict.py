@@ -9,18 +9,18 @@ import numpy as np
 
 from gyromodel._checks import thermometers
 from gyromodel.campaign import Campaign
-from gyromodel.declarations import BEHIND, EARLIER, RATE_OF, measured
 from gyromodel.diagnosis._apart import like, twins
 from gyromodel.diagnosis._beside import UNKNOWN_EVIDENCE
 from gyromodel.diagnosis._causes import cause_of
 from gyromodel.diagnosis._drivers import smooth_columns
 from gyromodel.diagnosis._exchange import uncontested
 from gyromodel.diagnosis._judgement import Judgement, also_held, as_set
+from gyromodel.diagnosis._next_tests import test_of_driver, test_of_names
 from gyromodel.diagnosis._points import levels
 from gyromodel.diagnosis._ranking import SLOW_IN_TIME, TIME_MARGIN, Ranking, is_driver, is_noise, special_cases
 from gyromodel.diagnosis._result import CREDIBLE, VAGUE, Cause, ParameterValue, Verdict
 from gyromodel.diagnosis._rounded import curve_of_rounding, no_farther, no_larger, of_rounding
-from gyromodel.diagnosis._said import places, told, told_of_cause, told_of_driver, told_of_rest
+from gyromodel.diagnosis._said import places, told, told_of_cause, told_of_driver, told_of_rest, told_of_walk
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._selection import Selection
 from gyromodel.diagnosis._shapes import remaining
@@ -29,8 +29,6 @@ from gyromodel.effects._shapes import beyond_earth
 from gyromodel.effects.drivers import BiasPeriodic
 from gyromodel.estimate import Estimate
 from gyromodel.model import effect_class
-from gyromodel.signals import Record
-from gyromodel.units import factor
 
 # Where the noise is slow even with them, these have no edge that a random walk could not make, whatever their lead.
 NO_EDGE = ("bias_drift", "bias_warmup")
@@ -126,6 +124,7 @@ def judge(
     causes, sets = [causes[i] for i in order], [sets[i] for i in order]
     if selection.remains and not selection.unresolved:
         findings.append(told_of_rest(selection, extended))
+    findings += told_of_walk(steps, last)
     driver, share = remaining(scanner, steps.baseline, selection)
     if driver and curve_of_rounding(steps, selection, driver, saw_tooth):
         findings.append(
@@ -159,15 +158,27 @@ def judge(
         return judged("unknown", causes, {selection.remains: 1.0})
     if not causes:
         return judged("adequate", (), {})
-    for cause, members in zip(causes[1:], sets[1:], strict=True):
-        if len(members) > 1:
-            findings.append(also_held(cause.effect, members))
     named = [c for c, s in zip(causes, sets, strict=True) if len(s) == 1]
-    if len(sets[0]) == 1:
+    doubt = _left_open(sets, {c.effect for c in named})
+    for i, (cause, members) in enumerate(zip(causes, sets, strict=True)):
+        if len(members) > 1 and i != doubt:
+            findings.append(also_held(cause.effect, members))
+    if doubt is None:
         return judged("named", named, sets[0])
-    firm = [c for c in named if c.effect not in sets[0]]
-    test = _next_test(list(sets[0]), scanner.record, causes[0])
-    return judged("ambiguous", (*as_set(causes[0], sets[0]), *firm), sets[0], next_test=test)
+    cause, members = causes[doubt], sets[doubt]
+    firm = [c for c in named if c.effect not in members]
+    test = test_of_names(list(members), scanner.record, cause)
+    return judged("ambiguous", (*as_set(cause, members), *firm), members, next_test=test)
+
+
+def _left_open(sets: Sequence[dict[str, float]], firm: set[str]) -> int | None:
+    """The first of some causes' sets of names that leaves open what is missing; none where all are firm.
+
+    What may be noise, rounding or a part of a firm cause need not be anything else: only as the strongest is it open.
+    """
+    taken = firm | {"quantisation"}
+    open_to = (i for i, s in enumerate(sets) if len(s) > 1 and not (taken & s.keys() or any(map(is_noise, s))))
+    return 0 if len(sets[0]) > 1 else next(open_to, None)
 
 
 def _ranking_of(steps: Steps, selection: Selection, i: int) -> Ranking:
@@ -232,19 +243,6 @@ def _outweighed(causes: Sequence[Cause], selection: Selection, domain: str) -> b
     return bool(causes and selection.remains != "outliers" and more > least)
 
 
-def test_of_driver(driver: str) -> str:
-    """What to measure of an error that follows some columns and has no name."""
-    bases, forms = zip(*(measured(c) for c in smooth_columns(driver)), strict=True)
-    if bases == ("time",):
-        return "Repeat the run from power-on, everything held: noise does not come back."
-    how = "in steps up and down"
-    if RATE_OF in forms:
-        how = "in ramps of several speeds up and down"
-    elif {EARLIER, BEHIND} & set(forms):
-        how = "in steps held until nothing changes any more"
-    return f"Vary {' and '.join(bases)} alone, {how}, everything else held, and repeat the run."
-
-
 def _left_by(cause: Cause, causes: Sequence[Cause], estimate: Estimate, vague: bool) -> dict[str, float]:
     """The stronger cause that may leave a faint or a vague one, by its form or a thermometer's noise.
 
@@ -298,29 +296,3 @@ def _unrepeated(scanner: Scanner, bad: np.ndarray) -> bool:
         return False
     level = levels(scanner.record, scanner.points)
     return any(np.sum(level[~bad] == own) < 2 for own in level[bad])
-
-
-def _next_test(names: list[str], record: Record, cause: Cause) -> str:
-    if "outliers" in names and cause.points and "rate" in record.signals:
-        rate = np.asarray(record.signals["rate"])[list(cause.points)] * factor("rad/s", "deg/s")
-        levels = ", ".join(dict.fromkeys(f"{r:.4g}" for r in sorted(rate)))
-        return (
-            f"Repeat the points at {levels} deg/s several times, in both directions and in random order: anomalous "
-            "test points do not come back, a curve does."
-        )
-    if "quantisation" in names:
-        return effect_class("quantisation").test
-    if {"bias_periodic", "noise_quantisation"} <= set(names):
-        return (
-            "Run the rates at another speed, or read the output in finer steps: what rounding makes of a steady change "
-            "moves or vanishes, a line stays."
-        )
-    if any(n.startswith("noise_") for n in names) and not all(n.startswith("noise_") for n in names):
-        return "Repeat the run: a deterministic change comes back the same, noise does not."
-    if all(n.startswith("noise_") for n in names):
-        return (
-            "A longer record at rest: in the Allan deviation flicker levels off, a random walk goes on rising and a "
-            "Markov process falls again."
-        )
-    tests = [effect_class(n).test for n in names if n != "outliers" and not n.startswith("noise_")]
-    return " ".join(dict.fromkeys(tests))

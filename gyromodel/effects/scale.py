@@ -55,7 +55,7 @@ class ScaleAsymmetry(Effect):
     site = "scale"
     needs = ("rate",)
     cause = "The torquer or the optical path responds differently to the two senses of rotation."
-    test = "At least three rates of each sign, and rest: an even nonlinearity bends, an asymmetry does not."
+    test = "More rates of each sign, and rest: an even nonlinearity bends, an asymmetry does not."
 
     difference: Float[Array, ""] = parameter("ppm", 100.0, "scale factor at positive minus at negative rates")
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from gyromodel._atomic import write_text
 from gyromodel.report._numbers import count, number, pair, unit_text
-from gyromodel.report._sentence import confused, held, kinds, member, sentence
+from gyromodel.report._sentence import confused, gave_up, held, kinds, member, sentence
 from gyromodel.report._tables import (
     cause_row,
     evidence,
@@ -160,8 +160,10 @@ def _tiles(diagnosis: Diagnosis) -> list[dict[str, str]]:
         low, high = gain.ci95
         note = f"95 % interval {number(low, 3)} to {number(high, 3)}"
         tiles.append({"label": "Error before ÷ after", "value": f"{number(gain.ratio, 3)}", "note": note})
-    best = max((r.statistic for r in diagnosis.rounds if r.added), default=None)
-    top = [c.statistic for r in diagnosis.rounds[:1] for c in r.ranking]
+    # Gross errors that were given up say nothing of the simulation.
+    aside = diagnosis.verdict == "adequate" and gave_up(diagnosis)
+    best = max((r.statistic for r in diagnosis.rounds if r.added and not aside), default=None)
+    top = [c.statistic for r in diagnosis.rounds[-1 if aside else 0 :][:1] for c in r.ranking]
     if best is None and top:
         best = max(top)
     if best is not None:

@@ -82,12 +82,18 @@ def searched(diagnosis: Diagnosis) -> list[str]:
     return [name for name in dict.fromkeys([*diagnosis.searched, *diagnosis.minimum_detectable]) if name not in had]
 
 
+def gave_up(diagnosis: Diagnosis) -> bool:
+    """Whether single samples or dwells were given up as gross errors."""
+    return any(step.added == "outliers" for step in diagnosis.rounds)
+
+
 def _adequate(diagnosis: Diagnosis) -> str:
     names = searched(diagnosis)
     drivers = [name for name in names if is_driver(name)]
     tried = len(names) - len(drivers)
     smooth = f" and smooth functions of {len(drivers)} drivers" if drivers else ""
-    count = f": {tried} effects{smooth} were searched and none stands out from the noise" if tried else ""
+    but = "but for gross errors that were given up, none" if gave_up(diagnosis) else "none"
+    count = f": {tried} effects{smooth} were searched and {but} stands out from the noise" if tried else ""
     error = diagnosis.gain.before
     left = ""
     if math.isfinite(error):

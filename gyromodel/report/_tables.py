@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from gyromodel.report._numbers import count, number, pair, percent, stated, unit_text, with_uncertainty
-from gyromodel.report._sentence import Held, confused, followed, kinds, searched
+from gyromodel.report._sentence import Held, confused, followed, gave_up, kinds, searched
 from gyromodel.report._words import driver_columns, is_driver, listed, phrase, spoken, title
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ def _step(index: int, step: Round, kind: str) -> dict[str, str]:
         "id": "" if kind == "driver" else step.added,
         "statistic": evidence(step.statistic),
         "held_out": number(step.held_out, 3),
-        "score": evidence(step.log_score),
+        "score": evidence(step.log_score) if math.isfinite(step.log_score) else "–",
     }
 
 
@@ -186,7 +186,10 @@ def noise_kinds(diagnosis: Diagnosis) -> str:
 def searched_rows(diagnosis: Diagnosis) -> list[dict[str, str]]:
     """Each searched name with the smallest size that would have been seen, and what was found of it."""
     doubtful = confused(diagnosis) if diagnosis.verdict == "ambiguous" else ()
-    found = dict.fromkeys([*doubtful, *diagnosis.credible_set], "possible")
+    had = {row.effect for row in diagnosis.baseline.table()}
+    added = [row.effect for row in diagnosis.extended.table() if row.effect not in had]
+    found = dict.fromkeys([*added, *doubtful, *diagnosis.credible_set], "possible")
+    found |= {"outliers": "given up"} if gave_up(diagnosis) else {}
     found |= {cause.effect: "named" for cause in diagnosis.causes if cause.effect not in doubtful}
     rows = []
     for name in searched(diagnosis):

@@ -88,7 +88,7 @@ def information(
             common += [change * error for error in instrument.all_along(values)]
             white += (change * instrument.of_each(values)) ** 2 / together
     record = record._replace(sampling=record.sampling._replace(white=jnp.asarray(white)))
-    added = [np.asarray(model.columns_of(effect, signals)) for effect in rivals]
+    added = list(map(model.columns_at(signals), rivals))
     jacobian = np.column_stack([np.asarray(model.linearise(signals)[1]), *added]) / std
     columns = np.column_stack([jacobian, *common])
     padded = jnp.asarray(np.pad(columns, ((0, 0), (0, -columns.shape[1] % 16))))
