@@ -146,3 +146,14 @@ def test_a_curve_over_a_temperature_that_stands_still(rng: np.random.Generator, 
     found = gm.diagnose(log, gm.read_model(tmp_path / "model.yaml"), hold_out=False)
     assert found.verdict == "adequate"
     assert any("bias_temperature_curve (breakpoints)" in line for line in found.findings)
+
+
+def test_what_one_block_alone_tells_is_not_predicted_without_it(rng: np.random.Generator):
+    """A warm-up of 0.8 s at the start of 900 s: without the first fifth its amplitude was 1e99 deg/h."""
+    campaign = still(rng)
+    time = campaign.columns["time"]
+    output = campaign.columns["output"] + 3.0 * np.exp(-time / 0.8) + 0.2 * np.cos(0.3 * time)
+    found = gm.diagnose(campaign.with_column("output", output, "deg/h"), gm.model_from_effects(["bias", "bias_warmup"]))
+    assert [cause.effect for cause in found.causes] == ["bias_periodic"]
+    assert "1 more could not be predicted" in found.gain.scheme
+    assert 0.25 < found.gain.after < found.gain.before < 0.45

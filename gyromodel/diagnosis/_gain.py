@@ -20,6 +20,8 @@ POSITIONS = "positions"
 MOST_FOLDS = 10
 # Of each run, where none can be left out whole.
 PARTS = 5
+# Times that a parameter's uncertainty grows without some rows where these alone tell it, and no number is left.
+ALONE = 1e9
 
 
 def with_predictable_blocks(record: Record, model: GyroModel) -> Record:
@@ -50,6 +52,18 @@ def folds_of(record: Record) -> tuple[list[np.ndarray], str]:
     return [rows for rows in found if len(rows)], scheme
 
 
+def fit_without(record: Record, estimate: Estimate, rows: np.ndarray) -> Estimate:
+    """A model fitted without some rows, in the same noise.
+
+    Raises:
+        EstimateError: it cannot be, or these rows alone tell a parameter.
+    """
+    train = fit_record(record.without(rows), estimate.model_as_given(), ratios=estimate.ratios)
+    if train.std.shape == estimate.std.shape and (train.std > ALONE * estimate.std).any():
+        raise EstimateError("the rows left out alone tell a parameter")
+    return train
+
+
 def held_out(record: Record, train: Estimate, rows: np.ndarray) -> tuple[np.ndarray, float]:
     """Errors of a fold (as a rate) by a model fitted without it, and its log score given the other folds.
 
@@ -62,12 +76,12 @@ def held_out(record: Record, train: Estimate, rows: np.ndarray) -> tuple[np.ndar
     residual = np.asarray(record.signals["output"]) - predicted
     columns = np.column_stack([jacobian, residual])
     with_fold = _log_density(record, columns, train)
-    without = _log_density(record.without(rows), columns, train)
+    others = _log_density(record.without(rows), columns, train)
     errors = residual[rows] / slope[rows]
     if record.block_scheme == POSITIONS:
         number = np.unique(record.blocks[rows], return_inverse=True)[1]
         errors = np.bincount(number, errors) / np.bincount(number)
-    return errors, with_fold - without
+    return errors, with_fold - others
 
 
 def _log_density(record: Record, columns: np.ndarray, estimate: Estimate) -> float:
@@ -96,10 +110,9 @@ def ladder_error(record: Record, estimate: Estimate) -> tuple[float, float, bool
     """
     errors: dict[bool, list[np.ndarray]] = {False: [], True: []}
     score = 0.0
-    model = estimate.model_as_given()
     for rows in folds_of(record)[0]:
         try:
-            train = fit_record(record.without(rows), model, ratios=estimate.ratios)
+            train = fit_without(record, estimate, rows)
             # From the other solution it is a step or two.
             again = fit_record(train.record, train.model_as_given(), ratios=estimate.ratios, ordinary=True)
         except EstimateError:
@@ -137,7 +150,7 @@ def nested_gain(
     folds, scheme = folds_of(record)
     for k, rows in enumerate(folds):
         try:
-            base = fit_record(record.without(rows), baseline.model_as_given(), ratios=baseline.ratios)
+            base = fit_without(record, baseline, rows)
             extended = select(rows, base)
             e0, s0 = _errors(record, base, rows, ordinary[0])
             e1, s1 = _errors(record, extended, rows, ordinary[1])
