@@ -184,7 +184,7 @@ def simulate(
     simulated_by = read_model(model)
     if not simulated_by.noise:
         print(f"gyromodel: {model} states no noise, and none is drawn", file=sys.stderr)
-    pattern = read_plan(pattern_file) if plan else read_campaign(pattern_file)
+    pattern = read_plan(pattern_file) if plan else read_campaign(pattern_file, measured=False)
     simulated = simulate_campaign(simulated_by, pattern.axis(axis) if axis else pattern, seed)
     output.parent.mkdir(parents=True, exist_ok=True)
     write_campaign(simulated, output)

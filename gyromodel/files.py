@@ -41,11 +41,12 @@ _CF_UNITS = {"milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns"}
 _ZARR_FILES = ("zarr.json", ".zgroup")
 
 
-def read_campaign(path: str | os.PathLike[str]) -> Campaign:
+def read_campaign(path: str | os.PathLike[str], *, measured: bool = True) -> Campaign:
     """Read a campaign; the suffix says how: .csv, .csv.gz, .parquet, .nc or .zarr.
 
     Args:
         path: the file, or for Zarr the folder.
+        measured: whether an output is needed; an output that is missing or the same throughout is a count of rows else.
 
     Raises:
         CampaignError: the file cannot be read or its contents fail a check; one sentence names the file and the place.
@@ -60,6 +61,8 @@ def read_campaign(path: str | os.PathLike[str]) -> Campaign:
                 f"a {suffix} campaign is a {'folder' if suffix == '.zarr' else 'file'}, and this is none"
             )
         columns, units, metadata = _READERS[suffix](path)
+        if not measured:
+            columns, units, metadata = _with_any_output(columns, units, metadata)
         return Campaign(
             columns, units, metadata, path.name[: -len(suffix)] if suffix in path.name.lower() else path.name
         )
@@ -91,6 +94,16 @@ def write_campaign(campaign: Campaign, path: str | os.PathLike[str]) -> None:
 def is_zarr(path: Path) -> bool:
     """Whether a folder is a Zarr group or array."""
     return any((path / name).exists() for name in (*_ZARR_FILES, ".zarray"))
+
+
+def _with_any_output(columns: Mapping[str, Any], units: Mapping[str, str], metadata: Mapping[str, Any]) -> Contents:
+    """Contents of a campaign whose output is of no interest: one, a rate, where there is none or it says nothing."""
+    outputs = [name for name in columns if re.fullmatch("output(_[xyz])?", name)] or ["output"]
+    known = [values[np.isfinite(values)] for values in (np.asarray(columns.get(name, ()), float) for name in outputs)]
+    if any(name.startswith("gimbal_") for name in columns) or any(np.unique(values).size > 1 for values in known):
+        return {**columns}, {**units}, {**metadata}
+    counted = dict.fromkeys(outputs, np.arange(len(columns.get("time", ())), dtype=float))
+    return {**columns, **counted}, {**dict.fromkeys(outputs, "deg/s"), **units}, {"kind": "rate", **metadata}
 
 
 def _suffix(path: Path) -> str:

@@ -295,6 +295,21 @@ def test_a_target_of_no_known_kind_is_wrong_usage(bench: Path, run: Run, command
     assert not (bench / "new").exists()
 
 
+@pytest.mark.parametrize("output", ["", ",0", ","])
+def test_simulate_needs_no_measured_output(bench: Path, run: Run, output: str):
+    """Times and temperatures alone, or beside an output that says nothing, and without its kind."""
+    head = "time [s],temperature [degC]" + (",output [deg/h]" if output else "")
+    rows = [f"{60 * k},{20 + k}{output}" for k in range(30)]
+    (bench / "mission.csv").write_text("\n".join([head, *rows, ""]))
+    (bench / "model.yaml").write_text(
+        "effects: [{effect: bias_temperature, coefficient: 3 deg/h/degC, reference: 20 degC}]\n"
+    )
+    done = run("simulate", bench / "model.yaml", "--like", bench / "mission.csv", "-o", bench / "made.csv")
+    assert done.status == 0, done.err
+    made = read_campaign(bench / "made.csv")
+    assert np.rad2deg(made.si("output")) == pytest.approx(np.arange(30) / 1200.0)
+
+
 def test_simulate_says_that_no_noise_is_stated(bench: Path, run: Run):
     done = run("simulate", bench / "simulation.yaml", "--like", bench / "campaign.csv", "-o", bench / "quiet.csv")
     assert "states no noise, and none is drawn" in done.err
