@@ -136,7 +136,9 @@ def _rounds(steps: Steps, progress: Progress, avoid: str = "", begin: str = "") 
                 return other
         return Selection(steps.baseline, (), (), path[0].ranking, (steps.baseline,), driver)
     for i in range(1, len(path)):
-        if not path[i - 1].paired and (ahead := _ahead_of(path[i:], threshold)):
+        # What takes the place of an earlier name in a wider form is no further one.
+        wider = len(standing(path[: i + 1])) <= len(standing(path[:i]))
+        if not path[i - 1].paired and not wider and (ahead := _ahead_of(path[i:], threshold)):
             before, ranking = path[:i], path[i].ranking
             return Selection(
                 estimates[i], tuple(standing(before)), tuple(before), ranking, tuple(estimates[: i + 1]), ahead
