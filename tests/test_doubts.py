@@ -8,6 +8,7 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 
 import gyromodel as gm
+from gyromodel.effects.scale import ScaleFactor
 from gyromodel.report import sentence
 from gyromodel.report._tables import searched_rows
 
@@ -90,3 +91,16 @@ def test_what_a_walk_may_be_instead_is_told(rng: np.random.Generator):
         walk = [line for line in found.findings if line.startswith("What was taken for a random walk of the bias may")]
         told += found.verdict == "ambiguous" or any("bias_temperature" in line or "bias_drift" in line for line in walk)
     assert binom.cdf(told, 6, 0.9) > 1e-4
+
+
+def test_what_would_show_of_a_scale_factor_is_a_part_of_it(rng: np.random.Generator):
+    """Of a fixed one in counts: some standard errors by least squares, and not of its value in counts."""
+    rate = np.repeat([-20.0, -10.0, 0.0, 10.0, 20.0, 5.0, -5.0], 20)
+    columns = {"time": 5.0 * np.arange(140), "rate": rate, "output": 1000.0 * rate + rng.standard_normal(140)}
+    campaign = gm.Campaign(columns, {"time": "s", "rate": "deg/s", "output": "count/s"}, {"kind": "rate"})
+    effects = (*gm.model_from_effects(["bias"]).effects, ScaleFactor(value=np.rad2deg(1000.0), unit="count/deg"))
+    model = gm.GyroModel(effects, fixed=frozenset({("scale_factor", "value")}))
+    size, unit = gm.diagnose(campaign, model, hold_out=False).minimum_detectable["scale_factor"]
+    least = 1e6 / (1000.0 * np.sqrt(np.sum((rate - rate.mean()) ** 2)))
+    assert unit == "ppm"
+    assert 3.0 < size / least < 8.0

@@ -150,7 +150,9 @@ def build_bank(record: Record, model: GyroModel = NOTHING_KNOWN) -> Bank:
     of, gain = model.columns_at(record.signals), float(model.gain())
 
     def columns(effect: Effect, seen: Signals) -> np.ndarray:
-        return np.asarray(of(effect, seen)) / gain
+        # Of a gain by its relative change.
+        whole = float(effect.value) if effect.site == "gain" else 1.0  # type: ignore[attr-defined]
+        return np.asarray(of(effect, seen)) * whole / gain
 
     blocks: list[tuple[str, Literal["effect", "driver"], np.ndarray, Effect | None]] = []
     not_testable: dict[str, str] = {}
