@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from hashlib import sha256
 from pathlib import Path
 
@@ -22,10 +23,11 @@ from pyarrow import parquet
 
 from gyromodel import CampaignError, cli, compensate, export_calibration, files
 from gyromodel.batch import Entry, entries, pooled_table, read_results, run_batch, unit_statistics, write_table
+from gyromodel.batch import _references as references
 from gyromodel.batch import _results as storage
 from gyromodel.batch import _run as running
 from gyromodel.batch import _work as work
-from gyromodel.batch._references import referred
+from gyromodel.batch._references import open_references, referred
 from gyromodel.batch._results import SCHEMA, Results
 from gyromodel.campaign import Campaign
 from gyromodel.effects.drivers import BiasStep
@@ -146,6 +148,29 @@ def test_stated_noise_is_fitted_together_as_each_by_itself(tmp_path: Path, monke
         for noise, found in estimate.noise_table().items():
             stored = mine[noise]
             assert (stored["value"], stored["low"], stored["high"]) == (found["value"], found["lo"], found["hi"])
+
+
+def test_a_campaign_that_cannot_be_fitted_leaves_those_fitted_with_it(tmp_path: Path):
+    """Two lack the column that an effect needs; two others have other numbers of power cycles."""
+    (tmp_path / "archive").mkdir()
+    noise = STATED.split("\n")[1]
+    (tmp_path / "model.yaml").write_text(f"effects: [{{effect: bias}}, {{effect: bias_temperature}}]\n{noise}\n")
+    for k in range(4):
+        one = campaign(k)
+        write_campaign(one.without("temperature") if k in (0, 2) else one, tmp_path / "archive" / f"c{k}.csv")
+    rows = here(tmp_path).table.to_pylist()
+    assert {row["campaign"] for row in rows if row["status"] == "fitted"} == {"c1.csv", "c3.csv"}
+    assert {row["campaign"]: "temperature" in (row["reason"] or "") for row in rows if row["status"] == "failed"} == {
+        "c0.csv": True, "c2.csv": True,
+    }  # fmt: skip
+    (tmp_path / "model.yaml").write_text(f"effects: [{{effect: bias}}, {{effect: bias_turn_on}}]\n{noise}\n")
+    for k in range(4):
+        cycles = np.arange(LENGTHS[k % 2]) * (2 + (k > 1)) // LENGTHS[k % 2]
+        write_campaign(campaign(k).with_column("run", cycles, ""), tmp_path / "archive" / f"c{k}.csv")
+    rows = here(tmp_path, "other.parquet").table.to_pylist()
+    assert {row["status"] for row in rows} == {"fitted"}
+    offsets = Counter(row["campaign"] for row in rows if row["parameter"].startswith("bias_turn_on.offsets"))
+    assert offsets == {"c0.csv": 1, "c1.csv": 1, "c2.csv": 2, "c3.csv": 2}
 
 
 def test_what_begins_in_motion_is_fitted_together_as_each_by_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -678,6 +703,26 @@ def test_what_cannot_be_told_at_other_points_does_not_compare(tmp_path: Path):
         model, _, common = referred(estimate, {f"{effect}.{key}": (0.1, "")})
         assert not common
         assert model is estimate.model
+
+
+def test_each_reference_point_is_that_of_the_first_campaign_that_has_it(tmp_path: Path):
+    """The first has no thermometer; a second column comes late, and is no longer looked for after many without."""
+    many = []
+    for k in range(2):
+        other = campaign(k) if k else campaign(k).without("temperature")
+        write_campaign(other, tmp_path / f"c{k}.csv")
+        many.append(Entry(f"c{k}.csv", str(tmp_path / f"c{k}.csv")))
+    write_campaign(campaign(2).with_column("fan", np.arange(60.0), "V"), tmp_path / "fan.csv")
+    late = [*many, Entry("fan.csv", str(tmp_path / "fan.csv"))]
+    (tmp_path / "model.yaml").write_text("effects: [{effect: bias}]\n")
+    model = read_model(tmp_path / "model.yaml")
+    found = open_references(late, model, True)
+    assert found["bias_temperature.reference"][1] == "20 degC"
+    assert found["bias_fan.reference"][1].endswith(" V")
+    assert not [key for key in found if key.startswith(("bias_time", "bias_output", "bias_column"))]
+    unlike = open_references([*many, *many * references.ENOUGH, *late[2:]], model, True)
+    assert set(found) - set(unlike) == {"bias_fan.reference"}
+    assert open_references(late, model, False) == {}
 
 
 @pytest.mark.long

@@ -10,6 +10,8 @@ import numpy as np
 
 from gyromodel._yaml import exact_text
 from gyromodel.batch._archive import Entry
+from gyromodel.diagnosis._bank import OWN_EFFECTS
+from gyromodel.diagnosis._drivers import driver_names
 from gyromodel.effects import CATALOGUE, Effect, Signals
 from gyromodel.effects._base import lacking
 from gyromodel.effects.drivers import BiasColumn
@@ -18,16 +20,19 @@ from gyromodel.files import read_campaign
 from gyromodel.model import GyroModel
 from gyromodel.model_files import SETTING_UNITS, setting_unit
 from gyromodel.platform import is_platform
+from gyromodel.signals import Record
 
 # Values in internal units, and as texts, by effect and setting, such as bias_temperature.reference.
 References = dict[str, tuple[float, str]]
 # Steps in which a model at other reference points comes to the same predictions, and how near, relative to their
 # standard uncertainty.
 STEPS, SAME = 8, 1e-3
+# Campaigns in a row without a further reference point, after which no more are read for what a diagnosis may add.
+ENOUGH = 32
 
 
 def open_references(every: Sequence[Entry], model: GyroModel, diagnosing: bool) -> References:
-    """Reference points that the model leaves open: those of the first campaign that has them.
+    """Reference points that the model leaves open: each that of the first campaign that has it.
 
     With its own in each campaign, a bias would be that of another temperature every time.
 
@@ -37,7 +42,11 @@ def open_references(every: Sequence[Entry], model: GyroModel, diagnosing: bool) 
         diagnosing: whether those of the effects that a diagnosis may add are wanted too.
     """
     unset = {key for effect in model.effects for key, value, _ in _points(effect) if np.isnan(value)}
+    known: References = {}
+    without = 0
     for entry in every if unset or diagnosing else ():
+        if unset <= set(known) and (not diagnosing or without >= ENOUGH):
+            break
         try:
             campaign = read_campaign(entry.path)
             if is_platform(campaign):
@@ -46,29 +55,29 @@ def open_references(every: Sequence[Entry], model: GyroModel, diagnosing: bool) 
                 campaign = campaign.axis(campaign.outputs[0].removeprefix("output_"))
             record = read_for_fit([campaign])
             effects = [*model.prepared(record.signals).effects]
-            effects += [e for e in _addable(record.signals) if diagnosing and e.label not in model.labels]
+            effects += [e for e in _addable(record) if diagnosing and e.label not in model.labels]
         except Exception:  # its own row says why
             continue
         found = {
             key: (value, str(exact_text(value, setting_unit(effect, name, record))))
             for effect in effects
             for key, value, name in _points(effect)
-            if np.isfinite(value) and (diagnosing or key in unset)
+            if np.isfinite(value) and (diagnosing or key in unset) and key not in known
         }
-        if unset <= set(found):
-            return found
-    return {}
+        known |= found
+        without = 0 if found else without + 1
+    return known
 
 
-def _addable(signals: Signals) -> Iterator[Effect]:
-    """Effects with reference points that these signals may show."""
+def _addable(record: Record) -> Iterator[Effect]:
+    """Effects with reference points that a diagnosis of this record may add."""
     for kind in CATALOGUE.values():
         refers = kind is not BiasColumn and not {*SETTING_UNITS}.isdisjoint(kind.settings())
-        if refers and not lacking(kind.needs, signals):
-            yield kind().prepared(signals)
-    for effect in (BiasColumn(column=name) for name in signals):
-        if effect.label not in CATALOGUE:
-            yield effect.prepared(signals)
+        if refers and not lacking(kind.needs, record.signals):
+            yield kind().prepared(record.signals)
+    for name in driver_names(record):
+        if name not in OWN_EFFECTS:
+            yield BiasColumn(column=name).prepared(record.signals)
 
 
 def _points(effect: Effect) -> Iterator[tuple[str, float, str]]:

@@ -64,8 +64,8 @@ def run_batch(
 
     A campaign that cannot be read or fitted is a row with the reason. Campaigns that an earlier run has finished, and
     that have not changed since, are not examined again, unless the machine was at fault and not the data; those that
-    are gone from the archive leave the table. Reference points that the model leaves open are those of the first
-    campaign in all, so that their parameters compare; so are those of effects that a diagnosis adds.
+    are gone from the archive leave the table. A reference point that the model leaves open is that of the first
+    campaign that has it in all, so that their parameters compare; so are those of effects that a diagnosis adds.
 
     Args:
         archive: see `entries`.

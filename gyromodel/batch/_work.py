@@ -115,9 +115,11 @@ def _together(axes: Sequence[Ready], model: GyroModel) -> dict[int, list[Row]]:
     if not records:
         return {}
     fits = fit_many(records.values(), model, restarts=False)
-    lost = [unknown_rows(record, fits.model(k)) for k, record in enumerate(records.values())]
-    if any(lost):
-        records = {i: records[i].without(np.array(rows, int)) for i, rows in zip(records, lost, strict=True)}
+    lost = {
+        i: unknown_rows(record, fits.model(k)) for k, (i, record) in enumerate(records.items()) if fits.converged[k]
+    }
+    if any(lost.values()):
+        records = {i: records[i].without(np.array(rows, int)) for i, rows in lost.items()}
         fits = fit_many(records.values(), model, restarts=False)
     may_differ = any(not slot.linear for slot in model.slots())
     found = {}
