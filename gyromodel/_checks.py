@@ -165,6 +165,11 @@ def shown(text: str) -> str:
     return repr(text if len(text) <= 40 else text[:37] + "...")
 
 
+def legible(text: str) -> str:
+    """A file's name, or text with one in it, as UTF-8 can hold it: bytes of another coding as hexadecimal digits."""
+    return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+
+
 def check_metadata(metadata: dict[str, Any]) -> None:
     for key, value in metadata.items():
         if not isinstance(key, str) or not _METADATA_KEY.fullmatch(key):

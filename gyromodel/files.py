@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from gyromodel._atomic import replace_folder, sibling
-from gyromodel._checks import CampaignError, check_unit, shown
+from gyromodel._checks import CampaignError, check_unit, legible, shown
 from gyromodel._csv import (
     Contents,
     metadata_value,
@@ -39,6 +39,8 @@ _POSITION = "column"
 _CF_TIME = re.compile(r"(\w+) since .+")
 _CF_UNITS = {"milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns"}
 _ZARR_FILES = ("zarr.json", ".zgroup")
+# Attributes that HDF5 notes for itself.
+_RESERVED = ("CLASS", "DIMENSION_LIST", "NAME", "REFERENCE_LIST")
 
 
 def read_campaign(path: str | os.PathLike[str], *, measured: bool = True) -> Campaign:
@@ -63,9 +65,8 @@ def read_campaign(path: str | os.PathLike[str], *, measured: bool = True) -> Cam
         columns, units, metadata = _READERS[suffix](path)
         if not measured:
             columns, units, metadata = _with_any_output(columns, units, metadata)
-        return Campaign(
-            columns, units, metadata, path.name[: -len(suffix)] if suffix in path.name.lower() else path.name
-        )
+        name = path.name[: -len(suffix)] if path.name.lower().endswith(suffix) else path.name
+        return Campaign(columns, units, metadata, legible(name))
     except CampaignError as error:
         raise CampaignError(f"{path}: {error}") from error
     except OSError as error:
@@ -80,15 +81,18 @@ def write_campaign(campaign: Campaign, path: str | os.PathLike[str]) -> None:
         path: the target, replaced when it exists; its suffix says how to write.
 
     Raises:
-        CampaignError: the suffix is unknown or the target cannot be written.
+        CampaignError: the suffix is unknown, that kind of file cannot hold a metadata key, or the target cannot be
+            written.
     """
     path = Path(path)
     try:
-        writer = _WRITERS[_suffix(path)]
+        suffix = _suffix(path)
+        if suffix == ".nc" and (kept := next((key for key in campaign.metadata if key in _RESERVED), None)):
+            raise CampaignError(f"metadata '{kept}' has a name that NetCDF-4 keeps for itself: rename it")
     except CampaignError as error:
         raise CampaignError(f"{path}: {error}") from error
     with replacing(path) as temporary:
-        writer(campaign, temporary)
+        _WRITERS[suffix](campaign, temporary)
 
 
 def is_zarr(path: Path) -> bool:

@@ -495,6 +495,20 @@ def test_what_commands_have_written_is_no_campaign(tmp_path: Path):
     assert here(tmp_path, "archive/other.parquet").failed == 2
 
 
+@pytest.mark.skipif(sys.platform == "darwin", reason="every name is UTF-8 there")
+def test_names_of_another_coding_are_told_in_utf_8(tmp_path: Path):
+    """Two that differ in such a letter alone, and one that is no campaign."""
+    (tmp_path / "archive").mkdir()
+    (tmp_path / "model.yaml").write_text(STATED)
+    for k, letter in enumerate((b"\xe9", b"\xe8", b"\xea")):
+        write_campaign(campaign(2 * k), tmp_path / "archive" / os.fsdecode(b"gyro_" + letter + b".csv"))
+    (tmp_path / "archive" / os.fsdecode(b"gyro_\xea.csv")).write_text("time [s],output [deg/h]\n0,1\n")
+    rows = here(tmp_path).table.to_pylist()
+    assert Counter(row["campaign"] for row in rows) == {r"gyro_\xe9.csv": 4, r"gyro_\xe8.csv": 4, r"gyro_\xea.csv": 1}
+    assert r"gyro_\xea.csv: " in rows[-1]["reason"]
+    assert read_campaign(tmp_path / "archive" / os.fsdecode(b"gyro_\xe9.csv")).name == r"gyro_\xe9"
+
+
 def test_links_neither_double_nor_lose_a_campaign(tmp_path: Path):
     place = archive(tmp_path, 2)
     (tmp_path / "disk").mkdir()

@@ -456,3 +456,20 @@ def test_times_since_a_date_are_times(tmp_path: Path):
     campaign = read_campaign(tmp_path / "a.nc")
     assert campaign.units["time"] == "ms"
     assert np.diff(campaign.si("time")) == pytest.approx(0.5)
+
+
+def test_a_zarr_folder_of_another_name_keeps_all_of_it(tmp_path: Path):
+    write_campaign(small_campaign(), tmp_path / "z.zarr")
+    (tmp_path / "z.zarr").rename(tmp_path / "z.zarr.old")
+    assert read_campaign(tmp_path / "z.zarr.old").name == "z.zarr.old"
+
+
+@pytest.mark.parametrize("key", ["NAME", "CLASS", "REFERENCE_LIST", "DIMENSION_LIST"])
+def test_metadata_that_hdf5_keeps_for_itself_is_named(tmp_path: Path, key: str):
+    campaign = small_campaign().with_metadata({key: "north"})
+    with pytest.raises(CampaignError, match=f"a.nc: .*'{key}'"):
+        write_campaign(campaign, tmp_path / "a.nc")
+    assert os.listdir(tmp_path) == []
+    for suffix in set(FORMATS) - {".nc"}:
+        write_campaign(campaign, tmp_path / f"a{suffix}")
+        assert read_campaign(tmp_path / f"a{suffix}").metadata[key] == "north"

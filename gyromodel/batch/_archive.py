@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from gyromodel._checks import CampaignError
+from gyromodel._checks import CampaignError, legible
 from gyromodel.files import SUFFIXES, is_zarr, read_metadata
 
 # Metadata of campaigns that commands have computed columns for: copies, and no measurements.
@@ -70,6 +70,7 @@ def entries(archive: str, but: Path | None = None) -> list[Entry]:
         found = [entry for entry in found if Path(entry.path) != but.resolve()]
     if not found:
         raise CampaignError(f"{archive}: there is no campaign in it (looked for names ending in {', '.join(SUFFIXES)})")
+    found = [entry._replace(campaign=legible(entry.campaign)) for entry in found]
     times = Counter(entry.path for entry in found)
     if twice := next((entry.campaign for entry in found if times[entry.path] > 1), None):
         raise CampaignError(f"{archive}: names {twice} twice")

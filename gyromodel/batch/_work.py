@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import gyromodel
-from gyromodel._checks import CampaignError
+from gyromodel._checks import CampaignError, legible
 from gyromodel.batch._archive import Entry
 from gyromodel.batch._references import References, referred
 from gyromodel.campaign import Campaign
@@ -195,7 +195,7 @@ def _structure(effect: Effect) -> str:
 
 def failed(head: Row, error: Exception) -> Row:
     """The row of a campaign without a result; without its state, if another run may have one of the same data."""
-    reason = " ".join(str(error).split())
+    reason = legible(" ".join(str(error).split()))
     if not isinstance(error, REFUSALS):
         reason = f"internal error ({type(error).__name__}: {reason[:200]})"
     elif not isinstance(error.__cause__, OSError):
