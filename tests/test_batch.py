@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -267,6 +268,15 @@ def test_results_made_otherwise_are_kept(tmp_path: Path):
     start = read_model(tmp_path / "model.yaml")
     with pytest.raises(CampaignError, match="of another model: name another file"):
         run_batch(str(tmp_path / "archive"), start, "other", tmp_path / "results.parquet")
+    parts = tmp_path / ".results.parquet.parts"
+    parts.mkdir()
+    (parts / "00000001.parquet").write_bytes(before)
+    for there in (f"remove {tmp_path}/results.parquet and {parts}$", f"remove {parts}$"):
+        with pytest.raises(CampaignError, match=there):
+            run_batch(str(tmp_path / "archive"), start, "other", tmp_path / "results.parquet")
+        (tmp_path / "results.parquet").unlink(missing_ok=True)
+    shutil.rmtree(parts)
+    (tmp_path / "results.parquet").write_bytes(before)
     with pytest.raises(CampaignError, match="of another task"):
         run_batch(str(tmp_path / "archive"), start, "m", tmp_path / "results.parquet", diagnosing=True)
     other = tmp_path / "archive" / "below"
@@ -289,16 +299,69 @@ def test_two_runs_do_not_write_one_table(tmp_path: Path):
         storage.Results(tmp_path / "results.parquet", made_by).__enter__()
 
 
+def test_a_file_system_without_locks_is_no_other_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A fault of the disk is told as one."""
+
+    def flock(number: int) -> None:
+        def fails(*_: object) -> None:
+            raise OSError(number, os.strerror(number))
+
+        monkeypatch.setattr(storage.fcntl, "flock", fails)
+
+    for number in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
+        flock(number)
+        with storage.Results(tmp_path / "results.parquet", {}) as kept:
+            kept.add([{"campaign": "c"}])
+    flock(errno.EIO)
+    with pytest.raises(OSError, match="Input/output"):
+        storage.Results(tmp_path / "results.parquet", {}).__enter__()
+
+
+def test_a_result_is_on_disk_within_a_second_whenever_the_next_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Of two that end at once; a disk that is full meanwhile is told when the next is written."""
+    monkeypatch.setattr(storage, "PART_EVERY", 0.5)
+    parts = tmp_path / ".results.parquet.parts"
+
+    def on_disk() -> int:
+        return sum(len(parquet.read_table(part)) for part in parts.glob("*.parquet"))
+
+    with storage.Results(tmp_path / "results.parquet", {}) as kept:
+        for name in "ab":
+            kept.add([{"campaign": name}])
+        until = time.monotonic() + 10
+        while on_disk() < 2 and time.monotonic() < until:
+            time.sleep(0.02)
+        assert on_disk() == 2
+        with monkeypatch.context() as patched:
+            patched.setattr(storage, "write_table", full_disk)
+            with pytest.raises(OSError, match="No space"):  # noqa: PT012
+                for name in "cd":
+                    kept.add([{"campaign": name}])
+                    time.sleep(0.7)
+    assert on_disk() > 2
+
+
+def full_disk(*_: object) -> None:
+    raise OSError(28, "No space left on device")
+
+
+def test_a_table_that_a_link_leads_to_is_written_there(tmp_path: Path):
+    archive(tmp_path, 1)
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "results.parquet").symlink_to("disk/results.parquet")
+    here(tmp_path)
+    assert (tmp_path / "results.parquet").is_symlink()
+    assert here(tmp_path).examined == 0
+    assert (tmp_path / "disk" / "results.parquet").is_file()
+
+
 def test_a_full_disk_leaves_what_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     archive(tmp_path, 3)
     done = here(tmp_path)
     write_campaign(campaign(8), tmp_path / "archive" / "new.csv")
 
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
     with monkeypatch.context() as patched:
-        patched.setattr(storage.os, "fsync", full)
+        patched.setattr(storage.os, "fsync", full_disk)
         with pytest.raises(OSError, match="No space"):
             here(tmp_path)
     assert parquet.read_table(tmp_path / "results.parquet").equals(done.table)

@@ -326,6 +326,14 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pyt
     assert list(path.parent.iterdir()) == [path]
 
 
+def test_a_link_stays_one(tmp_path: Path):
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "model.yaml").symlink_to("kept/model.yaml")
+    write_model(model_from_effects(["bias"]), tmp_path / "model.yaml")
+    assert (tmp_path / "model.yaml").is_symlink()
+    assert read_model(tmp_path / "kept" / "model.yaml").labels == ("bias",)
+
+
 def entry(text: str) -> str:
     return f"gyro: fog\neffects:\n  - effect: bias\n  - {text}\n"
 

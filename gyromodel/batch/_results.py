@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
 import shutil
+import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -29,6 +31,8 @@ SCHEMA = pa.schema(
 )
 # Seconds of finished work that a kill may cost.
 PART_EVERY = 1.0
+# What a lock fails with where the file system knows none.
+UNKNOWN_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 # Under this key the table says what made it.
 MADE_BY = b"gyromodel"
 
@@ -53,6 +57,7 @@ class Results:
         self._tables: list[pa.Table] = []
         self._waiting: list[dict[str, Any]] = []
         self._written = 0.0
+        self._turn = threading.RLock()
 
     def __enter__(self) -> Self:
         # A table that cannot be continued is refused before anything is made beside it.
@@ -70,10 +75,14 @@ class Results:
     def _begin(self) -> None:
         """Take the lock, and then read what there is: a run that ends meanwhile has written another table."""
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            try:
+                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                if error.errno not in UNKNOWN_LOCKS:
+                    raise
             # The other run takes its lock away when it ends, and may do so between those two steps.
             same = os.path.samestat(os.fstat(self._lock.fileno()), os.stat(self._lock.name))
-        except OSError:
+        except (BlockingIOError, FileNotFoundError):
             same = False
         if not same:
             raise CampaignError(f"{self.path}: another run is writing it")
@@ -90,10 +99,11 @@ class Results:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None):
         """Keep what is finished, whatever ended the run."""
-        try:
-            self.flush()
-        finally:
-            self._lock.close()
+        with self._turn:
+            try:
+                self.flush()
+            finally:
+                self._lock.close()
 
     def finished(self) -> dict[str, str]:
         """The state in which each campaign was examined, by its name; empty where that has to be done again."""
@@ -106,19 +116,32 @@ class Results:
         return states
 
     def add(self, rows: Iterable[dict[str, Any]]) -> None:
-        """Take the rows of one campaign; they are on disk a moment later."""
-        self._waiting += rows
-        if time.monotonic() - self._written > PART_EVERY:
-            self.flush()
+        """Take the rows of one campaign; they are on disk a moment later, whenever the next ones come."""
+        with self._turn:
+            first = not self._waiting
+            self._waiting += rows
+            if time.monotonic() - self._written > PART_EVERY:
+                self.flush()
+            elif first:
+                timer = threading.Timer(PART_EVERY, self._flush_in_time)
+                timer.daemon = True
+                timer.start()
 
     def flush(self) -> None:
         """Write what waits as a part."""
-        if self._waiting:
-            table = self._table(self._waiting)
-            write_table(table, self._folder / f"{self._next:08d}.parquet")
-            self._tables.append(table)
-            self._waiting, self._next = [], self._next + 1
-        self._written = time.monotonic()
+        with self._turn:
+            if self._waiting:
+                table = self._table(self._waiting)
+                write_table(table, self._folder / f"{self._next:08d}.parquet")
+                self._tables.append(table)
+                self._waiting, self._next = [], self._next + 1
+            self._written = time.monotonic()
+
+    def _flush_in_time(self) -> None:
+        """As `flush`, in a thread that nobody asks what went wrong: the next flush meets it again, and tells."""
+        with self._turn, suppress(OSError):
+            if not self._lock.closed:
+                self.flush()
 
     def merge(self, order: Sequence[Entry]) -> pa.Table:
         """Write the table: each campaign of the archive once, in its order, as it was examined last."""
@@ -152,7 +175,10 @@ class Results:
         if made_by.get("references", "{}") == "{}":
             made_by["references"] = self.made_by.get("references")
         if other := " and ".join(sorted(k for k in self.made_by if made_by.get(k) != self.made_by[k])):
-            raise CampaignError(f"{path}: holds results of another {other}: name another file, or remove this one")
+            there = [str(self.path)] * (path == self.path) + [str(self._folder)] * self._folder.exists()
+            raise CampaignError(
+                f"{self.path}: there are results of another {other}: name another file, or remove {' and '.join(there)}"
+            )
         return table
 
     def _made_otherwise(self, part: Path) -> bool:
@@ -196,7 +222,9 @@ def read_results(path: Path) -> pa.Table:
 
 
 def write_table(table: pa.Table, path: Path) -> None:
-    """Whole or not at all, and on disk."""
+    """Whole or not at all, and on disk; of a link, what it leads to."""
+    if path.is_symlink():
+        path = Path(os.path.realpath(path))
     with sibling(path) as temporary:
         with open(temporary, "wb") as file:
             parquet.write_table(table, file, compression="zstd")
