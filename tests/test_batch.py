@@ -20,6 +20,7 @@ import numpy as np
 import psutil
 import pyarrow as pa
 import pytest
+from distributed import Client, LocalCluster
 from pyarrow import parquet
 
 from gyromodel import CampaignError, cli, compensate, export_calibration, files
@@ -694,6 +695,34 @@ def test_axes_and_diagnoses(tmp_path: Path):
     assert told == {("named", "bias_temperature")}
     assert all(r["gain_ratio"] > 2 for r in rows if r["axis"] != "z")
     assert any(r["parameter"] == "bias_temperature.coefficient" for r in rows)
+
+
+AT_ONCE = [0]
+
+
+def slow(_: object) -> list[int]:
+    """How many are examined at once, as if these were rows."""
+    AT_ONCE[0] += 1
+    time.sleep(0.2)
+    found = AT_ONCE[0]
+    AT_ONCE[0] -= 1
+    return [found]
+
+
+def test_workers_that_join_have_work(monkeypatch: pytest.MonkeyPatch):
+    """One of two threads, and another that comes when a lot has ended: as many lots are examined at once."""
+    monkeypatch.setattr(running, "WAITING", 1)
+    monkeypatch.setattr(running, "examine", slow)
+    lots = [running.Lot((), (), GyroModel(()), "m", False, {}) for _ in range(20)]
+    options = {"n_workers": 1, "threads_per_worker": 2, "processes": False, "dashboard_address": "127.0.0.1:0"}
+    with LocalCluster(**options) as cluster, Client(cluster) as client:
+        found = running._on_cluster(lots, 1, cluster.scheduler_address)
+        next(found)
+        cluster.scale(2)
+        client.wait_for_workers(2)
+        at_once = [rows[0] for _, rows in found]
+    assert len(at_once) == 19
+    assert max(at_once) > 2
 
 
 @pytest.mark.long

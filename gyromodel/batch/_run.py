@@ -25,7 +25,7 @@ from gyromodel.batch._results import Results, references_of
 from gyromodel.batch._work import Lot, Row, examine, failed, read
 from gyromodel.model import GyroModel
 
-# Lots that wait at each worker, so that none is idle, and times that one may lose its worker.
+# Lots that wait at each thread of a worker, so that none is idle, and times that one may lose its worker.
 WAITING, LOST = 4, 3
 # Campaigns, and bytes of their files, that are read and fitted in one go.
 MOST, LARGEST = 32, 16 << 20
@@ -162,15 +162,16 @@ def _on_cluster(lots: Sequence[Lot], workers: int, scheduler: str | None) -> Ite
             raise CampaignError(f"{scheduler}: no Dask scheduler answers there within {PATIENCE} s") from None
         waiting, of = deque(lots), {}
 
-        def submitted(count: int) -> list[Any]:
-            some = [waiting.popleft() for _ in range(min(count, len(waiting)))]
+        def submitted() -> list[Any]:
+            # Workers may have come since.
+            ahead = WAITING * max(workers, sum(client.nthreads().values()))  # pyright: ignore[reportAttributeAccessIssue]
+            some = [waiting.popleft() for _ in range(min(ahead - len(of), len(waiting)))]
             new = {client.submit(examine, lot, pure=False): lot for lot in some}
             of.update({future.key: lot for future, lot in new.items()})
             return list(new)
 
-        ahead = WAITING * max(workers, len(client.scheduler_info()["workers"]))
         try:
-            running = as_completed(submitted(ahead))
+            running = as_completed(submitted())
             for future in running:
                 # Without its scheduler a client cancels what it waits for, and would wait for ever for anything new.
                 if future.status == "cancelled" or client.status != "running":
@@ -184,7 +185,7 @@ def _on_cluster(lots: Sequence[Lot], workers: int, scheduler: str | None) -> Ite
                     waiting += [lot._replace(entries=(entry,), states=(state,)) for entry, state in both]
                 else:
                     yield lot, [failed(lot.heads()[0], future.exception())]
-                running.update(submitted(1))
+                running.update(submitted())
         except (CancelledError, ClosedClientError, OSError):
             lost = "the local cluster" if scheduler is None else f"{scheduler}: the Dask scheduler"
             raise CampaignError(f"{lost} was lost; the same command goes on from here") from None
