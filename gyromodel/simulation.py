@@ -28,7 +28,8 @@ def simulate(model: GyroModel, campaign: Campaign, seed: int = 0) -> Campaign:
 
     Raises:
         CampaignError: it is no campaign of one gyro.
-        ModelError: the model misses a value or a column, or what it states of the noise is none.
+        ModelError: the model misses a value or a column, or a column that an effect needs one in some row, or what the
+            model states of the noise is none.
     """
     if not campaign.outputs and any(name.startswith("gimbal_") for name in campaign.columns):
         raise CampaignError(f"{campaign.name}: is of a platform, and a model is simulated for a gyro")
@@ -45,6 +46,7 @@ def simulate(model: GyroModel, campaign: Campaign, seed: int = 0) -> Campaign:
         raise ModelError(f"effect {unset[0]} has no value; fit the model or write one to simulate")
     check_units(model, record.output_unit, record.units)
     model = model.prepared(record.signals)
+    _refuse_missing(model, record)
     output = np.asarray(model.predict(record.signals))[: record.rows]
     output = output + draw_noise(model, with_stated_level(record, model), np.random.default_rng(seed))
     kind = campaign.metadata.get("kind", "rate")
@@ -57,6 +59,16 @@ def simulate(model: GyroModel, campaign: Campaign, seed: int = 0) -> Campaign:
     if reading is not None:
         output = _read(output, reading, unit, str(kind))
     return campaign.with_column("output", output, unit)
+
+
+def _refuse_missing(model: GyroModel, record: Record) -> None:
+    """Refuse columns that an effect needs where a row misses its value."""
+    for effect in model.effects:
+        for name in sorted({*model.columns_needed(effect)} & {*record.signals}):
+            rows = np.flatnonzero(~np.isfinite(np.asarray(record.signals[name])[: record.rows])) + 1
+            if rows.size:
+                some = ", ".join(map(str, rows[:5])) + "…" * (rows.size > 5)
+                raise ModelError(f"effect {effect.label} needs column {name}, which is NaN in data rows {some}")
 
 
 def _read(output: np.ndarray, reading: Quantisation, unit: str, kind: str) -> np.ndarray:

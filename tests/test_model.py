@@ -324,6 +324,15 @@ def test_simulation_needs_values(effects, noise, message: str, rng: np.random.Ge
         simulate(GyroModel(effects, noise), campaign(rng))
 
 
+@pytest.mark.parametrize("kind", ["rate", "angle"])
+def test_simulation_names_the_rows_that_a_column_misses(kind: str, rng: np.random.Generator):
+    measured = campaign(rng, "deg/s" if kind == "rate" else "arcsec", kind)
+    model = GyroModel((ScaleFactor(value=value(1.0)), Bias(value=value(0.1))))
+    rate = np.where(np.isin(np.arange(len(measured)), [2, 6]), np.nan, measured.columns["rate"])
+    with pytest.raises(ModelError, match=r"scale_factor needs column rate, which is NaN in data rows 3, 7$"):
+        simulate(model, measured.with_column("rate", rate, measured.units["rate"]))
+
+
 def test_predict_is_compiled_once_and_differentiated(rng: np.random.Generator):
     traces = []
 
