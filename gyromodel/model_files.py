@@ -148,7 +148,7 @@ def _read_effect(place: Place) -> tuple[Effect, set[tuple[str, str]]]:
         raise named.error(str(problem)) from None
     declared = effect.declared()
     settings = effect.settings()
-    found = place.mapping(("effect", "value", "fixed", "std", *declared, *settings), label)
+    found = place.mapping(("effect", "value", "fixed", *declared, *settings), label)
     if "value" in found:
         given = found.pop("value")
         name = _meant(given, effect)

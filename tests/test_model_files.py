@@ -375,6 +375,7 @@ BAD = [
     (entry("{effect: bias_drift, value: [3 deg/h/h]}"), 4, "one value"),
     (entry("{effect: bias_drift, value: {std: 3 deg/h/h}}"), 4, "slope has no value"),
     (entry("{effect: bias_drift, value: {value: 3, unit: deg/h/h}}"), 4, "unknown key 'unit'"),
+    (entry("{effect: bias_drift, value: 3 deg/h/h, std: 1 deg/h/h}"), 4, "unknown key 'std' in bias_drift"),
     (entry("{effect: bias_drift, value: {value: {value: 3 deg/h/h}}}"), 4, "one value"),
     (entry("{effect: bias_drift, value: 3 deg/h/h, slope: 4 deg/h/h}"), 4, "value and slope are the same"),
     (entry("{effect: bias_warmup, value: 3}"), 4, "several parameters; name them: amplitude, time_constant"),
