@@ -20,11 +20,20 @@ def run_sensitivity(
 ) -> tuple[Sensitivity, dict[str, Any], PlanChoice | None]:  # fmt: skip
     """The study of the files, its result as plain data, and the best test plan where one was asked for."""
     from gyromodel._checks import CampaignError
+    from gyromodel.model import ModelError, make_effect
     from gyromodel.model_files import read_calibration
     from gyromodel.plan import read_plan
-    from gyromodel.study import best_plan, known, read_candidates, read_instruments, seconds, sensitivity
+    from gyromodel.study import OUTCOMES, best_plan, known, read_candidates, read_instruments, seconds, sensitivity
     from gyromodel.units import UnitError
 
+    if strange := next((name for name in outcomes if name not in OUTCOMES), None):
+        there = ", ".join(OUTCOMES)
+        raise typer.BadParameter(f"no outcome is called {strange}; there are {there}", param_hint="--outcome")
+    try:
+        for name in rivals:
+            make_effect(name)
+    except ModelError as error:
+        raise typer.BadParameter(str(error), param_hint="--rival") from None
     calibrated, mission = [read_calibration(path) for path in models], read_plan(plan)
     instruments = read_instruments(plan, mission)
     other = read_plan(design) if design else None

@@ -63,9 +63,11 @@ def sensitivity(
         raise typer.BadParameter(
             "is for a test plan, which needs --candidates", param_hint="--rival" if rival else "--criterion"
         )
+    criterion = criterion or ("discrimination" if rival else "outcome" if outcome else "parameters")
+    if criterion == "discrimination" and len({*(rival or [])}) < 2:
+        raise typer.BadParameter("effects are told apart where there are two or more", param_hint="--rival")
     from gyromodel._study_files import print_sensitivity, run_sensitivity
 
-    criterion = criterion or ("discrimination" if rival else "outcome" if outcome else "parameters")
     found, result, chosen = run_sensitivity(
         models, plan, design, outcome or [], candidates, budget, criterion, rival or [], sobol, draws, seed
     )

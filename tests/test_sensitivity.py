@@ -618,8 +618,6 @@ def test_a_test_plan_is_best_for_what_was_asked(files: Path, capsys: pytest.Capt
     assert attitude["best"]["times"] == rate["best"]["times"]
     # A thermometer that errs in all parts alike is told by the cold end, from the calibration there.
     assert {*plan("warm.yaml", "--outcome", "rate")["best"]["times"]} == {"cold", "warm"}
-    assert run(files / "model.yaml", "--plan", files / "warm.yaml", *more, "--rival", "bias_drift") != 0
-    assert "two rival effects" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -636,7 +634,6 @@ def test_a_test_plan_is_best_for_what_was_asked(files: Path, capsys: pytest.Capt
         ("model", ("0.5 degC", "0.5 V"), [], "no size in a unit like degC"),
         ("model", ("{temperature: 0.5 degC}", "{temperature: {often: 1 degC}}"), [], "common or independent"),
         ("model", None, ["--outcome", "position"], "needs latitude_deg"),
-        ("model", None, ["--outcome", "speed"], "no outcome is called speed"),
         ("model", None, ["--candidates", "PLAN", "--budget", "1 h"], "list of candidates"),
         ("model", None, ["--candidates", "C", "--budget", "1 s"], "fits into"),
         ("model", None, ["--candidates", "OTHER", "--budget", "4 h"], "instruments names nonsense"),
@@ -663,6 +660,24 @@ def test_a_budget_without_a_unit_is_wrong_usage(files: Path, capsys: pytest.Capt
     common = [files / "model.yaml", "--plan", files / "plan.yaml", "--candidates", files / "candidates.yaml"]
     assert run(*common, "--budget", "4") == 2
     assert "Invalid value for --budget: expected a time above zero" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (["--outcome", "speed"], "--outcome: no outcome is called speed; there are rate"),
+        (["--rival", "bias_drift", "--rival", "speed"], "--rival: unknown effect speed"),
+        (["--rival", "bias_drift"], "--rival: effects are told apart where there are two"),
+        (["--criterion", "discrimination"], "--rival: effects are told apart where there are two"),
+    ],
+)
+def test_names_that_are_none_are_wrong_usage_before_the_work(
+    files: Path, wrong: list[str], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr("gyromodel.model_files.read_calibration", None)
+    common = [files / "model.yaml", "--plan", files / "plan.yaml", "--candidates", files / "candidates.yaml"]
+    assert run(*common, "--budget", "4 h", *wrong) == 2
+    assert f"Invalid value for {said}" in " ".join(capsys.readouterr().err.split())
 
 
 def test_what_is_for_a_test_plan_needs_candidates(files: Path, capsys: pytest.CaptureFixture[str]):
