@@ -40,28 +40,28 @@ def diagnose_axes(
 ) -> tuple[dict[str, Any], str, tuple[str, ...]]:
     """Diagnose each axis that can be, and how the axes lie together; the answer, its words, the files."""
     from gyromodel._checks import CampaignError
+    from gyromodel.campaign import AXES
     from gyromodel.estimate import EstimateError
     from gyromodel.model import ModelError
     from gyromodel.three_axes import triad
 
     axes, not_diagnosed, said, written, extended = {}, {}, [], [], {}
-    for name in measured[0].outputs:
-        axis = name.removeprefix("output_")
-        dead = [reason for c in measured if name in c.columns and (reason := c.dead(name))]
-        alone = [] if dead else [campaign.axis(axis) for campaign in measured]
+    for axis in AXES:
+        if not any(f"output_{axis}" in campaign.columns for campaign in measured):
+            continue
         try:
-            if alone:
-                diagnosis, verdict = diagnose_to(alone, model, output / axis, calibrate=calibrate, seed=seed)
+            alone = [_axis(campaign, axis) for campaign in measured]
+            diagnosis, verdict = diagnose_to(alone, model, output / axis, calibrate=calibrate, seed=seed)
         except (CampaignError, EstimateError, ModelError) as error:
-            dead = [str(error)]
-        if dead:
-            not_diagnosed[axis] = dead[0]
+            not_diagnosed[axis] = str(error)
             continue
         axes[axis], extended[axis] = diagnosis.to_dict() | {"model": f"{axis}/model.yaml"}, diagnosis.extended
         said.append(f"Axis {axis}: {verdict}")
         written += [f"{axis}/{report}" for report in REPORTS]
     if not axes:
         raise CampaignError(f"no axis can be diagnosed; {'; '.join(f'{a}: {why}' for a, why in not_diagnosed.items())}")
+    for axis in set(AXES) - set(axes):
+        _remove_results(output / axis, model)
     for axis, reason in not_diagnosed.items():
         print(f"gyromodel: axis {axis} was not diagnosed: {reason}", file=sys.stderr)
     # An error that no name explains may pass for a lean of its axis.
@@ -79,3 +79,23 @@ def diagnose_axes(
     result = {"axes": axes, "not_diagnosed": not_diagnosed, "triad": lie and lie.to_dict()}
     write_text(output / "axes.json", json_text(result))
     return result, "\n".join([*said, *([lie.sentence()] if lie else [])]), (*written, "axes.json")
+
+
+def _axis(campaign: Campaign, axis: str) -> Campaign:
+    """One axis of a campaign; an error names the campaign."""
+    from gyromodel._checks import CampaignError
+
+    try:
+        return campaign.axis(axis)
+    except CampaignError as error:
+        raise CampaignError(f"{campaign.name}: {error}") from None
+
+
+def _remove_results(folder: Path, model: Path) -> None:
+    """Remove what an earlier run has written of an axis that has no results now; not the model that is read."""
+    from gyromodel.report._figures import FIGURES
+
+    figures = [path for pattern in FIGURES for path in (folder / "figures").glob(f"{pattern}.svg")]
+    for path in [*(folder / name for name in REPORTS), *figures]:
+        if path.exists() and not path.samefile(model):
+            path.unlink()

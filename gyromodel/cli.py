@@ -148,7 +148,7 @@ def diagnose(
     measured = read_campaigns(campaigns, axis)
     from gyromodel.platform import is_platform
 
-    if len(measured[0].outputs) > 1 and not is_platform(measured[0]):
+    if any(len(each.outputs) > 1 for each in measured) and not is_platform(measured[0]):
         result, verdict, written = diagnose_axes(measured, model, output, calibrate, seed)
     else:
         diagnosis, verdict = diagnose_to(measured, model, output, calibrate=calibrate, seed=seed)
@@ -261,6 +261,8 @@ def vibration(
     write_text(output / "vibration.json", json_text(result))
     for name, figure in figures.items():
         write_text(output / f"{name}.svg", figure)
+    for name in {"explanations", "loop"} - set(figures):  # of an earlier run
+        (output / f"{name}.svg").unlink(missing_ok=True)
     write_text(output / "report.html", vibration_page(test, figures, measured.name))
     if as_json:
         print(json_text(result), end="")

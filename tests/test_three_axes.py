@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -247,9 +248,18 @@ def test_an_axis_that_cannot_be_diagnosed_leaves_the_others(tmp_path: Path, monk
 
     diagnosis = diagnose(x_only, model_from_effects(["scale_factor", "bias"]), hold_out=False)
     monkeypatch.setattr(_diagnose_files, "diagnose_to", only_x)
+    (tmp_path / "y" / "figures").mkdir(parents=True)
+    (tmp_path / "model.yaml").write_text("effects: []", encoding="utf-8")
+    for name in ("report.html", "diagnosis.json", "model.yaml", "mine.txt", "figures/driver.svg", "figures/mine.svg"):
+        (tmp_path / "y" / name).write_text("of an earlier run", encoding="utf-8")
     found, said, _ = _diagnose_files.diagnose_axes([campaign], tmp_path / "model.yaml", tmp_path, 0, 0)
     assert (list(found["axes"]), found["triad"], said) == (["x"], None, "Axis x: Nothing is missing.")
     assert "wraps round" in found["not_diagnosed"]["z"]
-    assert "measures nothing" in found["not_diagnosed"]["y"]
+    assert found["not_diagnosed"]["y"].startswith(f"{campaign.name}: column 'output_y' is 0.0")
+    assert sorted(path.name for path in (tmp_path / "y").rglob("*.*")) == ["mine.svg", "mine.txt"]
+    second = replace(campaign.without("output_z"), name="second")
+    found, *_ = _diagnose_files.diagnose_axes([second, campaign], tmp_path / "model.yaml", tmp_path, 0, 0)
+    assert list(found["axes"]) == ["x"]
+    assert found["not_diagnosed"]["z"].startswith("second: there is no axis 'z'")
     with pytest.raises(CampaignError, match="there is no axis 'x'"):
         _diagnose_files.diagnose_axes([campaign, x_only], tmp_path / "model.yaml", tmp_path, 0, 0)

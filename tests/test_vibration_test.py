@@ -8,6 +8,7 @@ import json
 import re
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -319,6 +320,16 @@ def test_the_command_prints_its_files(tmp_path: Path, capsys: pytest.CaptureFixt
     printed = capsys.readouterr().out
     assert all(str(path) in printed for path in (tmp_path / "out").iterdir())
     assert "axis none" not in printed
+
+
+def test_the_command_leaves_no_figure_of_an_earlier_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("gyromodel.platform.vibration_test", lambda *_: SimpleNamespace(to_dict=dict))
+    monkeypatch.setattr("gyromodel.report.vibration_figures", lambda _: {"attitude": "<svg/>"})
+    monkeypatch.setattr("gyromodel.report.vibration_page", lambda *_: "")
+    for name in ("explanations", "loop", "mine"):
+        (tmp_path / f"{name}.svg").write_text("<svg/>")
+    assert run([str(LOG), "-o", str(tmp_path), "--json"]) == 0
+    assert sorted(path.name for path in tmp_path.glob("*.svg")) == ["attitude.svg", "mine.svg"]
 
 
 def changed(campaign: Campaign, name: str, values: np.ndarray) -> Campaign:
