@@ -31,10 +31,11 @@ from gyromodel.diagnosis._result import Candidate, Cause, Confuser, Diagnosis, D
 from gyromodel.estimate import Estimate
 from gyromodel.estimate._calibration import ParameterRow
 from gyromodel.report import history_figure, sentence, with_uncertainty, write_report
-from gyromodel.report._figures import _column, figures
+from gyromodel.report._figures import _column, _output, figures
 from gyromodel.report._numbers import number, pair, percent, stated, unit_text
 from gyromodel.report._page import context
 from gyromodel.report._series import abscissae, bins, explained, thinned
+from gyromodel.report._template import _markup
 from gyromodel.report._words import PHRASES
 from gyromodel.study._sensitivity import History, Sensitivity
 
@@ -486,6 +487,32 @@ def test_residuals_are_drawn_over_every_driver_and_the_cause_first(rng: np.rando
     names = [path.stem for path in write_report(named_static(rng, 3000), tmp_path)[1:]]
     assert {"residual-phase", "residual-supply-voltage", "residual-temperature-coil"} <= set(names)
     assert "constant" in "".join(read(tmp_path / "report.html").text)
+
+
+@pytest.mark.parametrize(("away", "label"), [(-5.2, "output + 5.2 deg/s"), (5.2, "output − 5.2 deg/s")])
+def test_an_output_far_from_zero_is_drawn_less_an_offset_with_its_unit(away: float, label: str):
+    """Beside a power of ten that is of the axis, and not of the offset."""
+    rng = np.random.default_rng(1)
+    before = static_log(rng, 400)
+    output = before.columns["output"] - np.nanmedian(before.columns["output"]) + away
+    found = made(before, slope(before), 1e-4, rng)
+    far = np.full(400, away)
+    diagnosis = replace(
+        found, campaign=before.with_column("output", output, "deg/s"), predicted_before=far, predicted_after=far
+    )
+    assert f"{label} (10⁻⁵ deg/s)" in _output(diagnosis).svg
+
+
+@pytest.mark.parametrize(
+    ("text", "page"),
+    [
+        ("(3.6 ± 0.2)e-4 deg", "(3.6&nbsp;±&nbsp;0.2)&nbsp;×&nbsp;10<sup>−4</sup> deg"),
+        ("-2.50e7, 3e-5", "−2.50&nbsp;×&nbsp;10<sup>7</sup>, 3&nbsp;×&nbsp;10<sup>−5</sup>"),
+        ("smooth(T2e3), T_2e3, T1.5e3", "smooth(T2e3), T_2e3, T1.5e3"),
+    ],
+)
+def test_powers_of_ten_are_of_numbers_and_not_of_names(text: str, page: str):
+    assert str(_markup(text)) == page
 
 
 def test_drawings_of_others_are_left_alone(rng: np.random.Generator, tmp_path: Path):

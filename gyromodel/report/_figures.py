@@ -161,7 +161,8 @@ def _output(diagnosis: Diagnosis) -> Drawn:
         at = np.insert(x.values[rows], breaks + 1, np.nan)
         axes.plot(at, line, color=colour, linestyle=dash, linewidth=1.7, label=label, zorder=6)
     axes.set_xlabel(draw.axis_label(x.label, x.unit, 0))
-    axes.set_ylabel(draw.axis_label(f"output − {offset:g}" if offset else "output", unit, power))
+    apart_from = f" {'+' if offset < 0 else '−'} {abs(offset):g} {unit_text(unit)}".rstrip() if offset else ""
+    axes.set_ylabel(draw.axis_label(f"output{apart_from}", unit, power))
     draw.legend(axes, len(lines) + 1)
     caption = " ".join(["Squares: means of the measured output with their standard error.", *remarks])
     alt = f"Measured output over time with {' and '.join(label for label, *_ in lines)}."

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from importlib import resources
 from typing import Any
 
+from gyromodel import __version__
 from gyromodel.report._numbers import percent
 
 
@@ -28,7 +29,7 @@ def filled(template: str, values: Mapping[str, Any]) -> str:
         lstrip_blocks=True,
     )
     environment.filters |= {"pretty": _markup, "breakable": _breakable, "inline": inline, "percent": percent}
-    return environment.get_template(template).render(values, style=packaged("style.css"), version=_version())
+    return environment.get_template(template).render(values, style=packaged("style.css"), version=__version__)
 
 
 def _markup(text: str) -> Any:
@@ -37,8 +38,8 @@ def _markup(text: str) -> Any:
 
     safe = html.escape(text, quote=False).replace(" ± ", "&nbsp;±&nbsp;")
     safe = re.sub(r"(?<![\w-])-(?=\d)", "−", safe)
-    powers = re.compile(r"(?<=[\d)])e(-?)(\d+)\b")
-    return Markup(powers.sub(lambda found: f"&nbsp;×&nbsp;10<sup>{'−' * len(found[1])}{found[2]}</sup>", safe))
+    powers = re.compile(r"((?<![\w.])\d+\.?\d*|\))e(-?)(\d+)\b")
+    return Markup(powers.sub(lambda f: f"{f[1]}&nbsp;×&nbsp;10<sup>{'−' * len(f[2])}{f[3]}</sup>", safe))
 
 
 def _breakable(name: str) -> Any:
@@ -46,12 +47,3 @@ def _breakable(name: str) -> Any:
     from markupsafe import Markup
 
     return Markup(html.escape(name, quote=False).replace("_", "_<wbr>"))
-
-
-def _version() -> str:
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version("gyromodel")
-    except PackageNotFoundError:
-        return ""
