@@ -171,7 +171,19 @@ def _in_unit(where: str, text: Any, unit: str) -> float:
 
 
 def _seconds(where: str, text: Any) -> float:
-    value, unit = _quantity(where, text)
-    if not convertible(unit, "s") or value <= 0:
-        raise CampaignError(f"{where}: expected a time above zero with its unit, such as 10 s, not {text}")
+    try:
+        return seconds(text)
+    except (CampaignError, UnitError) as error:
+        raise CampaignError(f"{where}: {error}") from None
+
+
+def seconds(text: Any) -> float:
+    """A time with its unit, above zero.
+
+    Raises:
+        CampaignError, UnitError: it is none.
+    """
+    value, unit = quantity(str(text))
+    if not convertible(unit, "s") or not value > 0:
+        raise CampaignError(f"expected a time above zero with its unit, such as 10 s, not {text}")
     return value * factor(unit, "s")

@@ -34,15 +34,10 @@ def outcome_rows(found: Sensitivity) -> list[tuple[str, ...]]:
         most = [f"{row.name} {percent(row.share)}" for row in budget.rows[:NAMED] if row.share > 0.01]
         std, _ = _with_error(drawn.std, drawn.std_error)
         rows.append(
-            (budget.outcome, f"{_first_order(result):.3g}", f"{budget.total:.3g}" if _adds(budget) else "–", std,
+            (budget.outcome, f"{drawn.linear:.3g}", f"{budget.total:.3g}" if _adds(budget) else "–", std,
              unit_text(budget.unit), ", ".join(most))
         )  # fmt: skip
     return rows
-
-
-def _first_order(result: Result) -> float:
-    """Of a peak, which no entry alone is the size of, the draws to first order."""
-    return result.drawn.linear
 
 
 def _adds(budget: Budget) -> bool:

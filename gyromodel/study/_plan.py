@@ -19,12 +19,12 @@ from gyromodel._checks import CampaignError
 from gyromodel.campaign import Campaign
 from gyromodel.effects import Effect
 from gyromodel.model import GyroModel, ModelError, make_effect
-from gyromodel.plan import planned, read_yaml
+from gyromodel.plan import planned, read_yaml, seconds
 from gyromodel.signals import read_signals
 from gyromodel.study._known import Known
 from gyromodel.study._mission import with_known_output
 from gyromodel.study._next import blocks, covariance_after, information, without_shared
-from gyromodel.units import UnitError, convertible, factor, internal_unit, quantity
+from gyromodel.units import UnitError, factor, internal_unit
 
 Criterion = Literal["parameters", "outcome", "discrimination"]
 # Standard errors, relative to what all candidates together leave, of parameters that nothing is known of before.
@@ -122,14 +122,6 @@ def read_candidates(path: str | Path) -> list[Part]:
     if len({part.name for part in parts}) < len(parts) or not parts:
         raise CampaignError(f"{path}: give each candidate a name of its own")
     return parts
-
-
-def seconds(text: Any) -> float:
-    """A time with its unit, above zero."""
-    value, unit = quantity(str(text))
-    if not convertible(unit, "s") or not value > 0:
-        raise CampaignError(f"expected a time above zero with its unit, such as 4 h, not {text}")
-    return value * factor(unit, "s")
 
 
 def best_plan(
