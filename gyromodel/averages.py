@@ -26,7 +26,8 @@ def average(campaign: Campaign, maximum: int = MAXIMUM_ROWS, seconds: float = 0.
     """Means of consecutive samples, never across a gap or a change of segment, run or position.
 
     Increments and angles of the output become rates, so that a mean is one whatever its samples' spacing; other angles
-    are averaged by cosine and sine. Where a stretch ends, a
+    are averaged by cosine and sine. Means are of the samples with an output, where there are any: of a column that is
+    known beside none of these, of all. Where a stretch ends, a
     last group of less than half the samples is dropped, unless it is all of the stretch. Of a campaign with a feedback
     ramp the first samples are kept as they are: a mean over its turns tells nothing of its codes.
 
@@ -58,9 +59,10 @@ def average(campaign: Campaign, maximum: int = MAXIMUM_ROWS, seconds: float = 0.
     starts = np.flatnonzero(within % together == 0)
     counts = np.diff(np.append(starts, rows))
     kept = (2 * counts >= together) | (within[starts] == 0)
-    columns = {}
+    columns, measured = {}, np.isfinite(campaign.columns.get("output", time))
     for name, values in campaign.columns.items():
         seen = np.isfinite(values)
+        seen &= measured | ~np.repeat(np.logical_or.reduceat(seen & measured, starts), counts)
         total, count = (np.add.reduceat(x, starts)[kept] for x in (np.where(seen, values, 0.0), seen.astype(float)))
         columns[name] = np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
         if is_angle(campaign.units[name]):

@@ -22,14 +22,16 @@ from gyromodel.units import UnitError, convertible, factor, quantity
 
 # A step this many times the median within runs, where a run begins, is time in which the gyro was off.
 OFF = 1.5
-# Rounding errors of one sample that stand for all on the way from what was measured to what is compared.
-ROUNDED = 4.0
+# Rounding errors of one sample that stand for all on the way from what was measured to what is compared; the sample is
+# larger than this part of them, as a single one may be a fill value.
+ROUNDED, USUAL = 4.0, 0.99
 # Longer records are padded less: the work outweighs the compiling.
 FINER_FROM = 4096
 # How far most of the samples of a clock are from whole steps of it, in steps.
 JITTER = 0.05
-# A column missing in more than this share of the rows is not searched; rows without one of the others are left out.
-MOST_MISSING = 0.2
+# A column missing in more than this share of the rows is not searched; rows without one of the others are left out, up
+# to a share of them for all columns together.
+MOST_MISSING, MOST_LEFT_OUT = 0.2, 0.5
 # Stretches that are held out one by one, and may be power cycles.
 FEWEST_BLOCKS, MOST_BLOCKS = 4, 60
 
@@ -84,7 +86,8 @@ class Record(NamedTuple):
     @property
     def imprecision(self) -> float:
         """The variance that double precision leaves of a sample: its rounding, and that of what it is compared with."""
-        size = float(np.nanmax(np.abs(np.asarray(self.signals["output"])), initial=0.0))
+        sizes = np.sort(np.abs(np.asarray(self.signals["output"])[: self.rows][self.present]))
+        size = float(sizes[int(USUAL * (len(sizes) - 1))]) if len(sizes) else 0.0
         return (ROUNDED * np.finfo(float).eps * size) ** 2
 
     @property
@@ -138,8 +141,7 @@ def read_signals(campaigns: Sequence[Campaign] | Campaign) -> Record:
         CampaignError: columns, units or kinds of the campaigns do not match.
     """
     campaigns = [campaigns] if isinstance(campaigns, Campaign) else list(campaigns)
-    for other in campaigns[1:]:
-        _check_alike(campaigns[0], other)
+    _check_alike(campaigns)
     apart = columns_apart(campaigns)
     names = ["time", *(name for name in campaigns[0].covariates if name not in apart)]
     runs = _counted_on([c.si("run") for c in campaigns]) if "run" in names else []
@@ -223,20 +225,26 @@ def _counted_on(runs: Sequence[np.ndarray]) -> list[np.ndarray]:
     return counted
 
 
-def _check_alike(first: Campaign, other: Campaign) -> None:
-    """Refuse campaigns that are not of one unit, recorded alike."""
-    for key in ("kind", "serial", "rate_frame"):
-        a, b = first.metadata.get(key), other.metadata.get(key)
-        if a is not None and b is not None and a != b:
-            raise CampaignError(f"{other.name}: campaigns fitted together need the same {key}, but it is {b} after {a}")
-    for name in set(first.columns) & set(other.columns):
-        if not convertible(other.units[name], first.units[name]):
-            raise CampaignError(
-                f"{other.name}: column '{name}' is in [{other.units[name]}], but in [{first.units[name]}] in the first "
-                "campaign"
-            )
-    if first.equals(other):
-        raise CampaignError(f"{other.name}: the same data were given twice")
+def _check_alike(campaigns: Sequence[Campaign]) -> None:
+    """Refuse campaigns that are not of one unit, recorded alike, each given once."""
+    first, said, seen = campaigns[0], dict[str, object](), set[str]()
+    for campaign in campaigns if len(campaigns) > 1 else ():
+        metadata = {"rate_frame": "table"} | dict(campaign.metadata)
+        for key in ("kind", "serial", "rate_frame"):
+            if key in metadata and (before := said.setdefault(key, metadata[key])) != metadata[key]:
+                raise CampaignError(
+                    f"{campaign.name}: campaigns fitted together need the same {key}, but it is {metadata[key]} after "
+                    f"{before}"
+                )
+        for name in set(first.columns) & set(campaign.columns):
+            if not convertible(campaign.units[name], first.units[name]):
+                raise CampaignError(
+                    f"{campaign.name}: column '{name}' is in [{campaign.units[name]}], but in [{first.units[name]}] in "
+                    "the first campaign"
+                )
+        if (digest := campaign.digest()) in seen:
+            raise CampaignError(f"{campaign.name}: the same data were given twice")
+        seen.add(digest)
 
 
 def _time_on(campaign: Campaign, time: np.ndarray) -> np.ndarray:
@@ -295,16 +303,17 @@ def _by_run(record: Record, values: np.ndarray, of: Callable[[np.ndarray, np.nda
 def with_columns_known(record: Record) -> tuple[Record, list[str]]:
     """The record without the rows where a measured column is missing, and a sentence for each such column.
 
-    A column missing in more than a fifth of the rows is left as it is: it costs more than it can tell.
+    A column missing in more than a fifth of the rows is left as it is: it costs more than it can tell. So is one that
+    would cost more than half of them, together with those missing less often.
     """
-    signals, said = dict(record.signals), []
-    present = record.present
+    signals, said, present = dict(record.signals), [], record.present
     missing = {n: bad for n, v in signals.items() if n != "output" and (bad := ~np.isfinite(np.asarray(v))).any()}
-    for name, bad in missing.items():
+    for name, bad in sorted(missing.items(), key=lambda item: int((item[1][: record.rows] & present).sum())):
         lost = int((bad[: record.rows] & present).sum())
-        if lost > MOST_MISSING * present.sum():
+        less = record.without(np.flatnonzero(bad[: record.rows]))
+        if lost > MOST_MISSING * present.sum() or less.present.sum() < (1.0 - MOST_LEFT_OUT) * present.sum():
             continue
-        record = record.without(np.flatnonzero(bad[: record.rows]))
+        record = less
         if lost and name in record.units:
             said.append(f"{lost} rows without {name} were left out.")
     for name, bad in missing.items():

@@ -38,6 +38,18 @@ def test_an_angle_that_stands_or_never_wraps_has_its_plain_mean():
     assert found[1:3] == pytest.approx([3608.0, 3612.0])
 
 
+def test_means_are_of_the_samples_with_an_output():
+    """A perfect gyro that answers each tenth sample of a swept rate reads the rate; a column known elsewhere stays."""
+    row = np.arange(ROWS)
+    rate, place = 0.1 * row, np.where(row % 10 == 5, 20.0 + row, np.nan)
+    columns = {"time": 0.01 * row, "rate": rate, "temperature": place, "output": np.where(row % 10 == 0, rate, np.nan)}
+    units = {"time": "s", "rate": "deg/s", "temperature": "degC", "output": "deg/s"}
+    short, together = average(Campaign(columns, units, {"kind": "rate"}), 50)
+    assert together == 20
+    assert np.abs(short.columns["output"] - short.columns["rate"]).max() < 1e-12
+    assert short.columns["temperature"] == pytest.approx(30.0 + 20.0 * np.arange(50))
+
+
 def test_angles_that_turn_far_within_a_mean_are_told():
     assert turning(turned(6.1), 5) == ["azimuth"]
     assert turning(turned(1.1), 5) == []

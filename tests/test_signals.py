@@ -11,7 +11,7 @@ import pytest
 from gyromodel._checks import CampaignError
 from gyromodel.campaign import Campaign
 from gyromodel.numerics.smoothing import smooth_derivative
-from gyromodel.signals import Record, padded_length, read_signals, with_smooth_thermometers
+from gyromodel.signals import Record, padded_length, read_signals, with_columns_known, with_smooth_thermometers
 
 ROWS, STEP = 256, 20.0
 
@@ -350,3 +350,34 @@ def test_a_thermometer_of_noise_alone_is_smoothed_to_its_mean(rng: np.random.Gen
     apart = time < 9e4
     assert smooth[apart] == pytest.approx(20.0 + noise[apart].mean(), abs=1e-6)
     assert smooth[~apart] == pytest.approx((20.0 + climb)[~apart], abs=0.03)
+
+
+def test_campaigns_given_twice_and_rates_of_two_frames_are_refused(rng: np.random.Generator):
+    """Whichever of several they are; without a word the rate is relative to the Earth."""
+    time = STEP * np.arange(ROWS)
+    one, two, other = (campaign(time, rng.standard_normal(ROWS), rate=np.sin(time)) for _ in range(3))
+    with pytest.raises(CampaignError, match="the same data were given twice"):
+        read_signals([one, two, two])
+    inertial = Campaign(other.columns, other.units, {"kind": "rate", "rate_frame": "inertial"}, "inertial")
+    for pair in ([one, inertial], [inertial, one], [one, two, inertial]):
+        with pytest.raises(CampaignError, match="need the same rate_frame"):
+            read_signals(pair)
+
+
+def test_many_columns_with_gaps_of_their_own_do_not_leave_a_campaign_without_rows(rng: np.random.Generator):
+    """Six columns, each missing in another sixth of the rows: all rows would go for them."""
+    part = np.arange(ROWS) * 6 // ROWS
+    columns = {f"c{k}": np.where(part == k, np.nan, rng.standard_normal(ROWS)) for k in range(6)}
+    record, said = with_columns_known(
+        read_signals(campaign(STEP * np.arange(ROWS), rng.standard_normal(ROWS), **columns))
+    )
+    assert 0.5 * ROWS <= record.present.sum() < 0.7 * ROWS
+    assert 2 <= len(said) <= 3
+
+
+def test_the_precision_of_a_log_is_not_that_of_its_fill_value(rng: np.random.Generator):
+    output = rng.standard_normal(ROWS)
+    time = STEP * np.arange(ROWS)
+    usual = read_signals(campaign(time, output)).imprecision
+    output[17] = 1e30
+    assert read_signals(campaign(time, output)).imprecision == pytest.approx(usual, rel=0.3)

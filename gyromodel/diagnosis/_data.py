@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from gyromodel._checks import CampaignError
 from gyromodel.attitude import refuse_navigated, with_reference_rates
-from gyromodel.averages import MEAN_OF_ATTITUDE, MOST_TURN, as_rate, average, turning
+from gyromodel.averages import MAXIMUM_ROWS, MEAN_OF_ATTITUDE, MOST_TURN, as_rate, average, turning
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._readings import Readings, readings_of
 from gyromodel.diagnosis._variance import steps_of_output, stretch_still, thermometers_still
@@ -23,6 +23,8 @@ from gyromodel.units import convertible
 
 # What a pose tells is in its mean: within it, means over so long (s) are enough, and keep out a hand's tremor.
 MEAN_OF_POSE = 1.0
+# Rows that are searched of several campaigns together, and values of their columns: 4 GB of memory.
+MOST_ROWS, MOST_VALUES = 40_000, 320_000
 # Part of its range within which a column stands still in a stretch; stretches that may be runs, fewer than are dwells.
 STILL, MOST_STRETCHES = 0.1, 11
 
@@ -94,8 +96,8 @@ def _of_gyro(measured: Sequence[Campaign]) -> Data:
         if posed is not c
     ]
     shortened = [
-        average(c, seconds=MEAN_OF_POSE if c is not g else MEAN_OF_ATTITUDE * (g is not m))
-        for c, g, m in zip(campaigns, given, measured, strict=True)
+        average(c, most, MEAN_OF_POSE if c is not g else MEAN_OF_ATTITUDE * (g is not m))
+        for c, g, m, most in zip(campaigns, given, measured, _most_rows(campaigns), strict=True)
     ]
     if any(m > 1 for _, m in shortened):
         most = max(m for _, m in shortened)
@@ -137,6 +139,13 @@ def _of_gyro(measured: Sequence[Campaign]) -> Data:
     return Data(record, searched, rows_of, whole, tuple(findings), unit, output_unit, 0.0, readings, stepped, time_on)
 
 
+def _most_rows(campaigns: Sequence[Campaign]) -> list[int]:
+    """How many rows of each campaign are searched, as memory goes with the rows of all and with what is logged."""
+    total, logged = sum(map(len, campaigns)), max(len(c.covariates) for c in campaigns)
+    together = min(MOST_ROWS, MOST_VALUES // max(logged, 1))
+    return [min(MAXIMUM_ROWS, -(-len(c) * together // max(total, together))) for c in campaigns]
+
+
 def _without_power_cycles(record: Record, campaign: Campaign) -> Record:
     """The record of one campaign, its runs being stretches: nothing tells that the gyro was off between them."""
     time_on = record.signals["time"] + time_since_power_on(campaign)
@@ -160,7 +169,7 @@ def _of_means(record: Record, campaigns: Sequence[Campaign], means: Sequence[Cam
 
     The means of a line are smaller than it by as much as its phase turns within them (`BiasPeriodic`).
     """
-    steps = [float(np.median(np.diff(c.si("time")))) for c in campaigns]
+    steps = [float(np.median(np.diff(c.si("time")[np.isfinite(c.columns["output"])]))) for c in campaigns]
     late = [float(m.si("time")[0] - c.si("time")[0]) for c, m in zip(campaigns, means, strict=True)]
     counts = [max(round(float(np.median(np.diff(m.si("time")))) / s), 1) for m, s in zip(means, steps, strict=True)]
     rows, extra = [len(m) for m in means], len(record.sampling.present) - record.rows
