@@ -87,10 +87,10 @@ def body_rates(
     good = np.asarray(np.isfinite(attitude).all(axis=1))
     # A stretch begins where the row before it is missing or too long ago.
     starts = good & ~(np.r_[False, good[:-1]] & (np.diff(time, prepend=-np.inf) < MISSING_STEP * step))
-    stretch = np.where(good, np.cumsum(starts), 0)
     rates = np.full((len(time), 3), np.nan)
-    for first in np.flatnonzero(starts):
-        q = attitude[first : first + int((stretch == stretch[first]).sum())]
+    ends = np.flatnonzero(good & np.r_[starts[1:] | ~good[1:], True]) + 1
+    for first, end in zip(np.flatnonzero(starts), ends, strict=True):
+        q = attitude[first:end]
         if len(q) <= 2 * half:
             continue
         q = q * np.cumprod(np.r_[1.0, np.where(np.sum(q[1:] * q[:-1], axis=1) < 0, -1.0, 1.0)])[:, None]

@@ -43,9 +43,8 @@ def _by_stretch(
     time: np.ndarray, values: np.ndarray, of: Callable[[np.ndarray, np.ndarray], np.ndarray], into: np.ndarray
 ) -> np.ndarray:
     """What `of` makes of each stretch of two known values or more, put into an array."""
-    stretch, good = stretches_of(time), np.isfinite(values)
-    for s in np.unique(stretch):
-        here = good & (stretch == s)
-        if here.sum() > 1:
+    known = np.flatnonzero(np.isfinite(values))
+    for here in np.split(known, np.flatnonzero(np.diff(stretches_of(time)[known])) + 1):
+        if len(here) > 1:
             into[here] = of(time[here], values[here])
     return into
