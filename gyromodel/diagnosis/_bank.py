@@ -13,6 +13,7 @@ from gyromodel.diagnosis._drivers import driver_names, is_no_driver, unusable
 from gyromodel.diagnosis._smooths import products, smooths
 from gyromodel.effects import CATALOGUE, Effect, Signals
 from gyromodel.effects._base import lacking
+from gyromodel.effects._shapes import SLOW
 from gyromodel.effects.drivers import BiasColumn
 from gyromodel.model import GyroModel
 from gyromodel.signals import Record
@@ -97,7 +98,7 @@ class Bank:
 class BlockTable:
     """A bank's blocks as arrays, and the order in which those of a name and, within it, of a structure lie together.
 
-    `smallest` is the smallest coefficient of a positive effect.
+    `smallest` is the smallest coefficient of a positive effect, `leading` how many columns its sizes are told of.
     """
 
     def __init__(self, bank: Bank) -> None:
@@ -115,6 +116,8 @@ class BlockTable:
         self.price = np.array([b.price for b in bank.blocks])
         self._blocks = [b.name for b in bank.blocks]
         self._widths = np.array([b.width for b in bank.blocks], int)
+        leading = [b.width if b.effect is None else np.size(getattr(b.effect, b.effect.leading())) for b in bank.blocks]
+        self.leading = np.minimum(leading, self._widths)
         self._grown = np.array([b.effect is not None and b.effect.grown for b in bank.blocks])
         self._scaled = np.array([b.effect is not None and b.effect.site == "scale" for b in bank.blocks], bool)
 
@@ -235,6 +238,11 @@ def _missing(kind: type[Effect], record: Record, usable: Signals) -> str:
         if lacking((name,), usable):
             return f"needs a column {name}" + (f" in a unit like {usual_unit(name)}" if name in record.signals else "")
         reasons = [unusable(record, n) for n in name.split(" or ") if n in usable]
-        if reasons and all(reasons):
+        if reasons and all(reasons) and not (name == "rate" and _is_multiplied(kind, usable["rate"])):
             return " and ".join(reasons)
     return ""
+
+
+def _is_multiplied(kind: type[Effect], rate: Array) -> bool:
+    """Whether an effect of the scale factor or of another column shows at a steady rate, beyond the Earth's."""
+    return (kind.site == "gain" or len(kind.needs) > 1) and float(np.min(np.abs(rate))) > SLOW

@@ -172,7 +172,9 @@ class Steps:
         near = grown | {k for k in ranking.statistic if self._has_shape(k) and ranking.explained(k) >= least}
         if not near - {name} and (name not in near or driver < score):
             return ranking
-        each = [self.step(found, estimate, ranking, k) for k in {name, *near}]
+        # What needs no fit explains as much in one: evidence of a large effect is less than that of its fit.
+        alike = {k for k in ranking.statistic if self.scanner.bank.forms(k) and ranking.explained(k) >= least}
+        each = [self.step(found, estimate, ranking, k) for k in sorted({name, *near, *alike})]
         # Fits compare on the same data.
         given_up = Found("", None, rows_of(each), ranking)
         fits = {step.name: self.fit(standing([*found, step, given_up])) for step in each}
