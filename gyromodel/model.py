@@ -115,11 +115,13 @@ class GyroModel(eqx.Module):
     def with_effect(self, effect: Effect) -> GyroModel:
         """The model extended by one effect, which replaces any that it contains as a special case.
 
-        An effect of its own label gives way, and is free from then on, if all its parameters were fixed.
+        An effect of its own label gives way, and is free from then on, if all its parameters were fixed; those of which
+        there may be several stay beside it, and are free.
         """
-        replaced = {*effect.supersedes, *({effect.label} & self.wholly_fixed())}
+        freed = {effect.label} & self.wholly_fixed()
+        replaced = {*effect.supersedes, *(() if effect.scan else freed)}
         kept = tuple(e for e in self.effects if e.label not in replaced)
-        fixed = frozenset(key for key in self.fixed if key[0] not in replaced)
+        fixed = frozenset(key for key in self.fixed if key[0] not in replaced | freed)
         return replace(self, effects=(*kept, effect), fixed=fixed)
 
     def wholly_fixed(self) -> set[str]:

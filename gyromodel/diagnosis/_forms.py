@@ -60,7 +60,7 @@ def addition(
     assert isinstance(form, int)
     if name in ranking.tangents:
         return _grown(scanner, estimate, ranking.tangents[name], ranking.best_cell(name), pulses), ()
-    fixed = [e for e in estimate.model.effects if e.label == name and name in estimate.model.wholly_fixed()]
+    fixed = [e for e in estimate.model.effects if e.label == name in estimate.model.wholly_fixed() and not e.scan]
     effect = fixed[0] if fixed else form_effect(scanner, name, form)
     assert effect is not None
     if isinstance(effect, BiasReadoutCode):

@@ -24,6 +24,7 @@ from gyromodel.effects.drivers import BiasPeriodic, BiasStep
 from gyromodel.effects.geometry import Misalignment, TableHarmonic
 from gyromodel.effects.thermometer import TemperatureLag
 from gyromodel.estimate import Estimate
+from gyromodel.model import effect_class
 
 # Parts of an interval by which samples may be off a regular grid before they tell a line from its aliases.
 IRREGULAR = 0.01
@@ -83,8 +84,12 @@ def told(
 def told_of_cause(steps: Steps, step: Found, extended: Estimate, known: set[str]) -> Iterator[str]:
     """Sentences on one cause; `known` are the names told of anyway."""
     name, model = step.name, steps.baseline.model
-    if name in model.wholly_fixed():
+    if name in model.wholly_fixed() and effect_class(name).scan:
+        yield f"{name} of the simulation is fixed: it was set free beside the one that was found."
+    elif name in model.wholly_fixed():
         yield f"{name} is fixed in the simulation at a value that the data contradict: it was set free."
+    elif step.effect is not None and (had := sorted({*step.effect.supersedes} & model.wholly_fixed())):
+        yield f"{listed(had)} of the simulation is fixed: as a part of {name} it was set free."
     elif step.grows and name in model.labels:
         yield f"{name} is in the simulation, but not in this form: the extended model has it whole."
     if name == "scale_factor":

@@ -66,7 +66,7 @@ class BiasStep(Effect):
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """One from the epoch on."""
         after = stack((signals["time"] >= self.epoch).astype(float))
-        return after * _within(signals, (self.campaign,)) if self.campaign else after
+        return after * _within(signals, (self.campaign,))
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
@@ -78,7 +78,7 @@ class BiasPeriodic(Effect):
     """D += Σ A_j cos 2πf_j t + B_j sin 2πf_j t: lines at unknown frequencies.
 
     Of several campaigns `campaigns` says which each line is in (counted from 1), as every start has a phase of its own;
-    empty, lines are in all.
+    0 is all of them, as are all lines where it is empty.
     """
 
     id = "bias_periodic"
@@ -134,9 +134,9 @@ def _kept(signals: Signals, frequency: Float[Array, " *line"]) -> Float[Array, "
 
 
 def _within(signals: Signals, campaigns: tuple[int, ...]) -> Float[Array, "sample campaign"]:
-    """One where a sample is of a campaign, else zero; of one campaign alone, all are of the first."""
-    number = signals.get("campaign", jnp.ones_like(signals["time"]))
-    return (number[:, None] == jnp.array(campaigns)).astype(float)
+    """One where a sample is of a campaign, else zero; 0 is of any, and of one campaign alone all are of the first."""
+    number, of = signals.get("campaign", jnp.ones_like(signals["time"])), jnp.array(campaigns)
+    return ((number[:, None] == of) | (of == 0)).astype(float)
 
 
 class BiasColumn(Effect):
