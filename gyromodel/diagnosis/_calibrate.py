@@ -21,7 +21,8 @@ from gyromodel._cache import cache_folder
 from gyromodel.diagnosis._batch import Batch
 from gyromodel.diagnosis._drivers import RESPONSE_DRIVER
 from gyromodel.diagnosis._evidence import SAFE_THRESHOLD, log_sum
-from gyromodel.diagnosis._ranking import EXEMPT, TIME_MARGIN, UNLISTED, is_driver, skipped, tangents
+from gyromodel.diagnosis._lines import lines_of
+from gyromodel.diagnosis._ranking import EXEMPT, TIME_MARGIN, UNLISTED, contained_in, is_driver, skipped, tangents
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.estimate import Estimate, filter_of
 from gyromodel.noise import from_grams, gram_by_cell
@@ -41,7 +42,7 @@ SET = ("rate", "temperature", "acceleration", "azimuth", "table", "magnetic", "v
 COURSE, SAME = 32, 0.1
 
 # Counts the rules by which draws have been scored: those kept by an earlier one do not serve.
-RULE = 14
+RULE = 15
 
 _draw = jax.jit(jax.vmap(colour, in_axes=(None, 0)))
 
@@ -69,6 +70,7 @@ def null_scores(
                 return kept["scores"]
     skip = skipped(baseline.model, scanner.record.signals)
     continued = list(tangents(scanner, baseline.model, skip).values())
+    contained, lines = contained_in(scanner.bank, baseline.model), lines_of(baseline.model)
     filter = filter_of(scanner.record, baseline.ratios)
     rng, rows = np.random.default_rng(seed), len(scanner.present)
 
@@ -81,12 +83,12 @@ def null_scores(
     rest, scores = [g for g in cells if g not in first], []
     for start in range(0, draws, together):
         drawn = draw(together)
-        batches = scanner.run_many(first, columns, drawn, {}, tangents=continued)
+        batches = scanner.run_many(first, columns, drawn, contained, lines, continued)
         found = _significance(scanner, first, batches, skip)
         if rest:
             large = np.argsort(-found)[: round(together * LARGEST)]
             both = [b.of(large) for b in batches]
-            both += scanner.run_many(rest, columns, drawn[:, large], {}, tangents=continued)
+            both += scanner.run_many(rest, columns, drawn[:, large], contained, lines, continued)
             found[large] = _significance(scanner, [*first, *rest], both, skip)
         scores.append(found)
         say("calibrating the threshold", 0.06 + 0.18 * min(1.0, (start + together) / draws))

@@ -70,24 +70,33 @@ def cause_of(
             own = float(log_evidence_ratio(np.array(explained), result.rss, nu, 1))
             price = float(np.clip(own - statistic, min(scanner.bank.price(name), 0.0), np.log(shapes)))
             part = least_told(statistic, least, price, nu)
-            continues = name in ranking.tangents
-            parameters = tuple(_told(p, step.effect, part, continues, stated.get(p.name)) for p in parameters)
+            size = _size_of(step.effect, name in ranking.tangents, ranking.contained.get(name, 0))
+            parameters = tuple(
+                _told(p, step.effect, part, stated.get(p.name)) if p.name == size else p for p in parameters
+            )
         if isinstance(step.effect, BiasStep):
             own = [e for e in estimate.model.effects if isinstance(e, BiasStep)][-turn]
             parameters = tuple(_dated(scanner, ranking, own, g, p) for p in parameters)
     return Cause(name, parameters, statistic, p, adjusted, members.get(name, 0.0), confusers, step.points)
 
 
-def _told(
-    parameter: ParameterValue, effect: Effect | None, part: float, continues: bool, stated: float | None
-) -> ParameterValue:
-    """The one size of an effect with its interval, if at `part` of it it would not have been told.
+def _size_of(effect: Effect | None, continues: bool, contained: int) -> str:
+    """The one size that a search has told of an effect: its amplitude, or the coefficient that the model had not."""
+    if effect is None or continues:
+        return effect.amplitude_name() if effect is not None else ""
+    if not contained:
+        return effect.leading()
+    sizes = {k: np.size(getattr(effect, k)) for k, declared in effect.declared().items() if declared.linear}
+    names = [k if size == 1 else f"{k}[{i}]" for k, size in sizes.items() for i in range(size)]
+    return names[contained] if len(names) == contained + 1 else ""
 
-    Of an effect that continues others it is its amplitude; `stated` is what a fixed one was in the simulation.
+
+def _told(parameter: ParameterValue, effect: Effect | None, part: float, stated: float | None) -> ParameterValue:
+    """The size of an effect with its interval, if at `part` of it it would not have been told.
+
+    `stated` is what a fixed one was in the simulation.
     """
     if effect is None or not parameter.std > 0.0:
-        return parameter
-    if parameter.name != (effect.amplitude_name() if continues else effect.leading()):
         return parameter
     nothing = stated if stated is not None else 1.0 if effect.site == "gain" else 0.0
     z = (parameter.value - nothing) / parameter.std

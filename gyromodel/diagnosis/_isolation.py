@@ -21,7 +21,7 @@ from gyromodel.diagnosis._evidence import explained_for, safe_threshold
 from gyromodel.diagnosis._forms import step_at
 from gyromodel.diagnosis._ranking import skipped
 from gyromodel.diagnosis._scan import epochs_of
-from gyromodel.effects import CATALOGUE, Effect, Signals
+from gyromodel.effects import CATALOGUE, Effect
 from gyromodel.effects._base import evaluate
 from gyromodel.estimate import Estimate, as_read, filter_of, given_ratios, step_of, whiten_columns
 from gyromodel.model import GyroModel, ModelError, effect_class, make_effect
@@ -77,10 +77,19 @@ def _basis(columns: np.ndarray) -> np.ndarray:
     return u[:, s > 1e-6 * s.max(initial=0.0)]
 
 
-def _forms(effect: Effect, signals: Signals) -> list[Effect]:
-    """All forms of an effect that a search would try on some signals; itself if it has no others."""
-    forms = type(effect).candidates(signals) if effect.label == effect.id else []
+def _forms(effect: Effect, record: Record) -> list[Effect]:
+    """The forms of an effect that a search would try on a record, of steps some; itself if it has no others."""
+    if effect.scan == "step":
+        return _steps(record) or [effect]
+    forms = type(effect).candidates(record.signals) if effect.label == effect.id else []
     return [form for form in forms if not form.grown] or [effect]
+
+
+def _steps(record: Record) -> list[Effect]:
+    """Steps at some epochs, which stand for all; none where samples are too few."""
+    epochs = epochs_of(record)[0]
+    chosen = epochs[np.linspace(0, len(epochs) - 1, STEPS + 2).astype(int)[1:-1]] if len(epochs) else []
+    return [step_at(record, int(row)) for row in chosen]
 
 
 def nearest(view: View, truths: Sequence[Effect]) -> tuple[float, str, str]:
@@ -88,11 +97,10 @@ def nearest(view: View, truths: Sequence[Effect]) -> tuple[float, str, str]:
 
     In standard deviations; pairs of which one contains the other are left out.
     """
-    signals = view.record.signals
     found = [(np.inf, "", "")]
     left = [c @ np.asarray(e.linear()) for c, e in zip(view.columns_of(truths), truths, strict=True)]
     for rival in truths:
-        bases = [_basis(c) for c in view.columns_of(_forms(rival, signals))]
+        bases = [_basis(c) for c in view.columns_of(_forms(rival, view.record))]
         for truth, signal in zip(truths, left, strict=True):
             if truth is rival or truth.label in rival.supersedes or rival.label in truth.supersedes:
                 continue
@@ -119,9 +127,10 @@ def settling_test(
         campaigns: what was measured; of a platform none, whose next test is not computed.
         baseline: the simulation.
         extended: the fit with one of the effects.
-        names: the effects; gross errors and noise among them are left out.
+        names: the effects; gross errors and noise among them are left out, and lines that are none of the fit.
     """
-    names = [name for name in names if name != "outliers" and not name.startswith("noise_")]
+    left_out = {"outliers", *({"bias_periodic"} - {*extended.model.labels})}
+    names = [name for name in names if name not in left_out and not name.startswith("noise_")]
     first = next((name for name in names if name in extended.model.labels), None)
     if first is None or len(names) < 2 or not campaigns:
         return None
@@ -171,7 +180,7 @@ def _at_size(view: View, fitted: GyroModel, names: Sequence[str]) -> list[Effect
                 found.append(replace(grown, **{last: jnp.asarray(amount)}))
             continue
         tried = []
-        forms = _forms(make_effect(name).prepared(signals), signals)
+        forms = _forms(make_effect(name).prepared(signals), view.record)
         for form, columns in zip(forms, view.columns_of(forms), strict=True):
             coefficients, *_ = np.linalg.lstsq(columns, residual, rcond=1e-9)
             tried.append((float(np.sum((residual - columns @ coefficients) ** 2)), form, coefficients))
@@ -328,9 +337,8 @@ def _sizes(campaigns: Sequence[Campaign], model: GyroModel) -> Isolability:
     for block in bank.blocks:
         if block.effect is not None and block.name not in have:
             forms.setdefault(block.name, []).append(block.effect)
-    if "bias_step" in bank.scans and len(epochs := epochs_of(record)[0]):
-        chosen = epochs[np.linspace(0, len(epochs) - 1, STEPS + 2).astype(int)[1:-1]]
-        forms["bias_step"] = [step_at(record, int(row)) for row in chosen]
+    if "bias_step" in bank.scans and (steps := _steps(record)):
+        forms["bias_step"] = steps
     left = {name: view.columns_of(effects) for name, effects in forms.items()}
     whole = {name: view.columns_of(effects, whole=True) for name, effects in forms.items()}
     not_testable = {name.removeprefix(PART_OF): reason for name, reason in bank.not_testable.items()}

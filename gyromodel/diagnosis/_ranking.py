@@ -57,6 +57,7 @@ class Ranking:
     samples: int
     runs: int
     tangents: dict[str, Tangent] = field(default_factory=dict, repr=False)
+    contained: dict[str, int] = field(default_factory=dict, repr=False)
     fitted: frozenset[str] = frozenset()
 
     def best(self, *, drivers: bool, but: tuple[str, ...] = ()) -> tuple[str | None, float]:
@@ -202,11 +203,7 @@ def rank(
         marks = np.zeros((len(columns), len(pulses)))
         marks[list(pulses), np.arange(len(pulses))] = 1.0
         columns = np.concatenate([columns, marks], axis=1)
-    contained = {
-        b.name: sum(int(e.linear().size) for e in estimate.model.effects if e.label in b.effect.supersedes)
-        for b in scanner.bank.blocks
-        if b.effect is not None and b.effect.supersedes
-    }
+    contained = contained_in(scanner.bank, estimate.model)
     continued = tangents(scanner, estimate.model, skip)
     families = scanner.noise_families() if estimate.noise_given else {}
     wanted = sorted({*cells, *(g for f in families.values() for g in f)})
@@ -246,8 +243,34 @@ def rank(
     walks = {g: float(r.walk) > 0 for g, r in zip(cells, each, strict=True)}
     samples = scanner.degrees_of_freedom
     return Ranking(
-        statistic, posterior, results, prior, slow, walks, columns, residual, samples, scanner.runs, continued
+        statistic,
+        posterior,
+        results,
+        prior,
+        slow,
+        walks,
+        columns,
+        residual,
+        samples,
+        scanner.runs,
+        continued,
+        contained,
     )
+
+
+def contained_in(bank: Bank, model: GyroModel) -> dict[str, int]:
+    """How many columns of each candidate a model has already: its free coefficients of what the candidate contains."""
+    free = [
+        (e.label, np.size(getattr(e, name)))
+        for e in model.effects
+        for name, declared in e.declared().items()
+        if declared.linear and (e.label, name) not in model.fixed
+    ]
+    return {
+        b.name: sum(size for label, size in free if label in b.effect.supersedes)
+        for b in bank.blocks
+        if b.effect is not None and b.effect.supersedes
+    }
 
 
 def _of_markov(scanner: Scanner, walk: Any, columns: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -19,8 +19,9 @@ from gyromodel.diagnosis._bank import Bank, BlockTable
 from gyromodel.diagnosis._batch import Batch, CellResult
 from gyromodel.diagnosis._cells import Cells
 from gyromodel.diagnosis._evidence import FEW_SETS
+from gyromodel.diagnosis._left import Beside
 from gyromodel.diagnosis._lines import Line, line_grid
-from gyromodel.diagnosis._one_cell import Beside, OneCell
+from gyromodel.diagnosis._one_cell import OneCell
 from gyromodel.diagnosis._points import (
     DWELL_FITS,
     FEW_FITTED,
@@ -92,7 +93,7 @@ class Scanner:
         whole, left = (np.sum(self.bank.columns[present] ** 2, axis=0) for present in (self.present, other.present))
         gone = np.add.reduceat((left < LOST * whole).astype(int), [b.start for b in self.bank.blocks])
         other.points = [p for p in (p[other.present[p]] for p in self.points) if len(p)]
-        other._lost = ~self.table.drivers & (gone > 0)
+        other._lost = self._lost | (~self.table.drivers & (gone > 0))
         other.epochs, other._run_ends = epochs_of(other.record)
         other.cells, other.only_cells = self.cells.sampled(other.record.sampling), cells
         return other

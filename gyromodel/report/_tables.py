@@ -230,10 +230,12 @@ def parameters(diagnosis: Diagnosis) -> list[dict[str, str]]:
 def threshold(diagnosis: Diagnosis) -> str:
     bound = number(diagnosis.threshold, 2)
     if diagnosis.threshold_kind == "calibrated":
+        p = diagnosis.p_value
+        share = "" if p is None else f"As much evidence as here is reached in {100 * p:.2g} % of them."
         return (
             f"An effect is accepted when its evidence exceeds {bound}. This bound was calibrated: the best of all "
             "candidates exceeds it in one of 100 simulations or fewer of this campaign with its noise and nothing "
-            f"missing. As much evidence as here is reached in {100 * (diagnosis.p_value or 0.0):.2g} % of them."
+            f"missing. {share}"
         )
     return (
         f"An effect is accepted when its evidence exceeds {bound}, odds of {_odds(diagnosis.threshold)} after paying "
