@@ -95,6 +95,8 @@ def _remove_results(folder: Path, model: Path) -> None:
     """Remove what an earlier run has written of an axis that has no results now; not the model that is read."""
     from gyromodel.report._figures import FIGURES
 
+    if not (folder / "diagnosis.json").exists():
+        return
     figures = [path for pattern in FIGURES for path in (folder / "figures").glob(f"{pattern}.svg")]
     for path in [*(folder / name for name in REPORTS), *figures]:
         if path.exists() and not path.samefile(model):
