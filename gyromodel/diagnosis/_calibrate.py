@@ -158,7 +158,7 @@ def _design(scanner: Scanner, baseline: Estimate, draws: int, seed: int) -> tupl
     searched = [*((b.name, b.structure) for b in bank.blocks if b.kind == "effect"), *bank.scans]
     model = baseline.model
     same = (__version__, RULE, EXEMPT, model.labels, sorted(model.fixed), model.level, scanner.stated, draws, seed,
-            searched, scanner.runs)  # fmt: skip
+            searched, scanner.runs, scanner.outliers)  # fmt: skip
     columns = []
     for name in sorted(n for n in record.signals if n.startswith(SET)):
         values = np.asarray(record.signals[name])[: record.rows]

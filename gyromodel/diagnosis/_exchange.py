@@ -138,18 +138,18 @@ def _chosen_again(
         ):
             continue
         step = steps.step(others, base, ranking, name)
-        changed = [*others[:i], step, *others[i:]]
-        if len(standing(changed)) < len(changed):
+        again = [*others[:i], step, *others[i:]]
+        if len(standing(again)) < len(again):
             continue
-        after = steps.fit(changed)
+        after = steps.fit(again)
         if (
             after is None
             or not steps.keeps(base, step, after)
-            or not steps.fits_better(changed, found, EXCHANGE * reshaped)
+            or not steps.fits_better(again, found, EXCHANGE * reshaped)
         ):
             continue
         if not unresolved(after, step, steps.scanner.step):
-            found, estimate, rankings = changed, after, {i: ranking}
+            found, estimate, rankings = again, after, {i: ranking}
     return found, estimate, rankings
 
 

@@ -15,14 +15,16 @@ if TYPE_CHECKING:
 
 # A column's energy, as a part of the greatest of its block, that single precision takes for none.
 NOTHING = 1e-40
+# Part of a column's energy from which on what is left of it has a size of its own.
+SHOWN = 1e-3
 
 
 class Width(NamedTuple):
     """The blocks of one number of columns beside a baseline.
 
     `turn` takes a block's columns to orthonormal directions of what is left of them, `left` in number, and to zeros;
-    `energy` is what is left of the column that sizes are told of, or where nothing is, on average; `blocks` and
-    `columns` are where they stand.
+    `energy` is what is left of the first column that sizes are told of and that the baseline leaves, else on average;
+    `blocks` and `columns` are where they stand.
     """
 
     blocks: slice
@@ -84,8 +86,10 @@ class Beside:
             turn = vectors / norm[:, :, None] * np.where(keep, np.where(keep, values, 1.0) ** -0.5, 0.0)[:, None, :]
             left = keep.sum(axis=1)
             energy = np.sum(values * keep, axis=1) / np.maximum(left, 1) * np.mean(square, axis=1)
-            told = np.einsum("bii->bi", rest) * (np.arange(q) < self.scanner.table.leading[blocks, None])
-            energy = np.where((left > 0) & (told.max(axis=1) > VANISHED), np.max(told * square, axis=1), energy)
+            share = np.einsum("bii->bi", rest)
+            told = (share > SHOWN) & (np.arange(q) < self.scanner.table.leading[blocks, None])
+            first = np.arange(count), told.argmax(axis=1)
+            energy = np.where((left > 0) & told[first], (share * square)[first], energy)
             found.append(Width(blocks, columns, turn, left, energy))
         return found
 

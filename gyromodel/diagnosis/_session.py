@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -35,18 +35,20 @@ class Session:
 
     def __init__(self, scanner: Scanner, baseline: Estimate, threshold: float) -> None:
         self.record, self.scanner, self.baseline, self.threshold = scanner.record, scanner, baseline, threshold
-        self._ladder: dict[int, tuple[float, float, bool]] = {}
+        # Estimates are kept beside what is theirs, so that no other takes their number.
+        self._ladder: dict[int, tuple[Estimate, tuple[float, float, bool]]] = {}
+        self._fits: dict[Hashable, Estimate | None] = {}
 
     def ladder(self, estimate: Estimate) -> tuple[float, float, bool]:
         """Held-out rms, log score and weighting of an estimate's structure, computed once."""
         if id(estimate) not in self._ladder:
-            self._ladder[id(estimate)] = ladder_error(estimate.record, estimate)
-        return self._ladder[id(estimate)]
+            self._ladder[id(estimate)] = estimate, ladder_error(estimate.record, estimate)
+        return self._ladder[id(estimate)][1]
 
     @property
     def steps(self) -> Steps:
         """What tries steps of this search."""
-        return Steps(self.scanner, self.baseline, self.threshold)
+        return Steps(self.scanner, self.baseline, self.threshold, fits=self._fits)
 
     def run(self, progress: Progress = None, noise: NoisePath = ()) -> Selection:
         """The rounds."""

@@ -51,9 +51,10 @@ def variance_drivers(record: Record) -> dict[str, np.ndarray]:
             if np.isfinite(inside).all() and np.ptp(inside) > 0:
                 found[label] = (values - inside.min()) / np.ptp(inside)
     interval = np.asarray(record.sampling.interval)
-    low, high = np.quantile(interval[: record.rows], [0.05, 0.95])
+    within = ~np.asarray(record.sampling.restart)[: record.rows]
+    low, high = np.quantile(interval[: record.rows][within], [0.05, 0.95])
     if high > CHANGED * low:
-        # Means over another time have another scatter. Gaps are no interval.
+        # Means over another time have another scatter. Gaps are no interval, nor has a first row one.
         found["sample interval"] = (np.clip(interval, low, high) - low) / (high - low)
     return found
 
