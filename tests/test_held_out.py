@@ -118,10 +118,19 @@ def test_blocks_alike_by_chance_do_not_make_a_gain_known_better_than_noise_leave
     n, draws = 1000, rng.standard_normal((4000, 1000))
     power, before = np.sum(draws**2, axis=1), np.sum((draws + signal / np.sqrt(n)) ** 2, axis=1)
     mean = 1.0 + signal**2 / n
-    gain = _summary(np.full(5, mean), np.ones(5), np.full(5, signal**2 / 10), n, "fifths", "deg/h", 1.0)
+    gain = _summary(
+        np.full(5, mean), np.ones(5), np.full(5, signal**2 / 10), np.full(5, n // 5), "fifths", "deg/h", 1.0
+    )
     half = 1.96 * np.std(0.5 * np.log(before / power))
     assert np.log(gain.ci95[1] / gain.ratio) == pytest.approx(half, rel=0.1)
     assert np.array(gain.log_score_ci95) == pytest.approx(0.5 * signal**2 + 1.96 * signal * np.array([-1, 1]), rel=1e-3)
+
+
+def test_the_error_of_blocks_of_unlike_lengths_is_that_of_their_rows():
+    before, after, sizes = np.array([9.0, 1.0, 4.0]), np.array([4.0, 1.0, 1.0]), np.array([10, 1000, 90])
+    gain = _summary(before, after, np.zeros(3), sizes, "runs", "deg/h", 1.0)
+    assert gain.before == pytest.approx(np.sqrt(np.repeat(before, sizes).mean()))
+    assert gain.after == pytest.approx(np.sqrt(np.repeat(after, sizes).mean()))
 
 
 @pytest.mark.parametrize("effect", ["bias", "bias_pressure", "bias_turn_on"])

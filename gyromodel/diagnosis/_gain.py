@@ -146,7 +146,7 @@ def nested_gain(
         ordinary: whether the model before and the one after are used with ordinary weights.
         progress: called with folds done and in all.
     """
-    before, after, scores, number = [], [], [], 0
+    before, after, scores, sizes = [], [], [], []
     folds, scheme = folds_of(record)
     for k, rows in enumerate(folds):
         try:
@@ -159,12 +159,12 @@ def nested_gain(
         before.append(np.mean(e0**2))
         after.append(np.mean(e1**2))
         scores.append(s1 - s0)
-        number += len(e0)
+        sizes.append(len(e0))
         if progress:
             progress(k + 1, len(folds))
     if lost := len(folds) - len(scores):
         scheme += f" ({lost} more could not be predicted)"
-    return _summary(np.array(before), np.array(after), np.array(scores), number, scheme, unit, scale)
+    return _summary(np.array(before), np.array(after), np.array(scores), np.array(sizes), scheme, unit, scale)
 
 
 def _errors(record: Record, train: Estimate, rows: np.ndarray, ordinary: bool) -> tuple[np.ndarray, float]:
@@ -176,9 +176,9 @@ def _errors(record: Record, train: Estimate, rows: np.ndarray, ordinary: bool) -
 
 
 def _summary(
-    before: np.ndarray, after: np.ndarray, scores: np.ndarray, number: int, scheme: str, unit: str, scale: float
+    before: np.ndarray, after: np.ndarray, scores: np.ndarray, sizes: np.ndarray, scheme: str, unit: str, scale: float
 ) -> Gain:
-    """The gain of folds with so many errors in all: their mean squares before and after, and gains in log score."""
+    """The gain of folds: their mean squares before and after, gains in log score, and numbers of errors."""
     folds = len(scores)
     if folds < 2:
         return Gain(
@@ -192,16 +192,17 @@ def _summary(
             0.0,
             (-np.inf, np.inf),
         )
-    rms = float(np.sqrt(before.mean()) * scale), float(np.sqrt(after.mean()) * scale)
+    rms = tuple(float(np.sqrt(np.average(each, weights=sizes)) * scale) for each in (before, after))
     ratio = rms[0] / rms[1] if min(rms) > 0 else 1.0
     # Jackknife over blocks for the ratio, Student's t over blocks for the log score; few blocks may be alike by chance,
     # so neither is taken to be known better than white noise of that many errors leaves it.
-    logs = np.array([0.5 * np.log(np.delete(before, k).mean() / np.delete(after, k).mean()) for k in range(folds)])
+    totals = np.stack([before, after]) * sizes
+    logs = 0.5 * np.log(np.divide(*(totals.sum(axis=1, keepdims=True) - totals)))
     spread = np.sqrt((folds - 1) / folds * np.sum((logs - logs.mean()) ** 2))
     t, z = float(stats.t.ppf(0.975, folds - 1)), float(stats.norm.ppf(0.975))
     total, error = float(scores.sum()), float(np.sqrt(folds) * scores.std(ddof=1))
     beside = max(t * error, z * np.sqrt(2.0 * abs(total)))
-    half = max(t * spread, z * np.sqrt(-np.expm1(-4.0 * abs(np.log(ratio))) / (2.0 * number)))
+    half = max(t * spread, z * np.sqrt(-np.expm1(-4.0 * abs(np.log(ratio))) / (2.0 * sizes.sum())))
     interval = (float(ratio * np.exp(-half)), float(ratio * np.exp(half)))
     return Gain(
         rms[0],
