@@ -17,6 +17,7 @@ import pytest
 
 import gyromodel
 from gyromodel import cli, declarations
+from gyromodel.noise_analysis import analyse_noise
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = Path(gyromodel.__file__).parent
@@ -80,6 +81,26 @@ def test_the_ring_laser_table_is_what_the_demo_finds():
     assert f"ln B = {found.rounds[1].statistic:.1f};" in README
     error = f"{found.rounds[1].held_out:.3f} deg/s instead of {found.rounds[0].held_out:.1f})"
     assert error in " ".join(README.split())
+
+
+def test_the_page_of_results_has_every_key(tmp_path: Path):
+    """Of a diagnosis that finds something, a fit and an Allan deviation; and no key that there is not."""
+    page = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
+    simulate_demo(tmp_path)
+    campaign = gyromodel.read_campaign(tmp_path / "campaign.csv")
+    found = gyromodel.diagnose(campaign, gyromodel.model_from_effects(["bias", "bias_temperature"]), hold_out=False)
+    diagnosed = found.to_dict() | {"model": ""}
+    results = {
+        "diagnosis.json": {*diagnosed, *(f"causes[].{key}" for key in diagnosed["causes"][0])},
+        "fit.json": {*found.extended.to_dict()},
+        "allan.json": {*analyse_noise(campaign).to_dict()},
+    }
+    for name, keys in results.items():
+        part = page.split(f"## {name}")[1].split("\n## ")[0]
+        told = re.findall(r"^\| (`.+?`) \|", part, re.MULTILINE)
+        named = [key for row in told for key in re.findall(r"`([^`]+)`", row)]
+        whole = {f"causes[].{key}" if key in ("p_adjusted", "places") else key for key in named}
+        assert whole == keys, name
 
 
 def test_an_effect_in_one_file_enters_the_catalogue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
