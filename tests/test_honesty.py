@@ -482,6 +482,16 @@ def test_sizes_of_what_vanishes_in_some_noise_are_those_of_the_other(apart: floa
     assert 1e-3 < found.minimum_detectable["bias_temperature_curve"][0] < 0.1
 
 
+def test_sessions_days_apart_are_searched_for_slow_lines_and_said_to_be():
+    """Times are rounded there; at half of that clock's rate a sine is nothing, and explained all (ln B 499)."""
+    time = np.concatenate([172_800.0 * k + np.arange(80.0) for k in range(3)])
+    output = 3.0 + np.random.default_rng(0).standard_normal(240)
+    log = gm.Campaign({"time": time, "output": output}, {"time": "s", "output": "deg/h"}, {"kind": "rate"})
+    found = gm.diagnose(log, gm.model_from_effects(["bias"]), hold_out=False)
+    assert found.verdict == "adequate"
+    assert found.not_testable["bias_periodic"].startswith("above 0.19 Hz: beside gaps")
+
+
 def test_fits_of_more_parameters_pay_for_each():
     """Ordinary least squares in white noise: −½ n ln RSS − ½ p ln n, up to one constant."""
     rng = np.random.default_rng(1)

@@ -23,6 +23,8 @@ from gyromodel.signals import Record
 LOWEST_LINES, SPACED_LINES, HIGHEST_LINES, PEAKS, PEAK_WIDTH = 24, 24, 12, 12, 6
 # Lines closer than this many steps of the grid (a quarter of the resolution each) are one that is not steady.
 RESOLVED = 4
+# Places in time that a record's samples stand at, at most.
+MOST_PLACES = 2**18
 # Fewer cycles in the record than this are a trend, not a line.
 FEWEST_CYCLES = 1.5
 
@@ -152,12 +154,16 @@ def line_grid(record: Record) -> LineGrid | None:
     grid = record.interval
     if np.abs(time[: record.rows] / grid - np.round(time[: record.rows] / grid)).max() > 0.1:
         grid /= 4.0
-    grid = max(grid, span / 2**18)
+    fastest = _highest(record.interval, span)
+    if grid < span / MOST_PLACES:
+        # Beside long gaps times are rounded to the grid, which slow lines hardly feel.
+        grid = span / MOST_PLACES
+        fastest = min(fastest, 0.25 / grid)
     # scipy declares no return type here.
     length = cast(int, scipy.fft.next_fast_len(int(np.ceil(4.0 * (span + grid) / grid)), real=True))
     first = int(np.ceil(FEWEST_CYCLES / span * length * grid))
     frequencies = np.arange(first, length // 2 + 1) / (length * grid)
-    frequencies = frequencies[frequencies < _highest(record.interval, span)]
+    frequencies = frequencies[frequencies < fastest]
     if not len(frequencies):
         return None
     index = np.minimum(np.round(time / grid).astype(int), length - 1)

@@ -26,6 +26,8 @@ from gyromodel.units import factor, from_internal, internal_unit
 POWER = 0.84
 # Standard deviations that no size to be told exceeds, and halvings of the interval it is looked for in.
 BEYOND, HALVINGS = 1e3, 20
+# Part of half the sample rate that lines are searched to where all are.
+WHOLE = 0.9
 
 
 def remaining(scanner: Scanner, baseline: Estimate, selection: Selection) -> tuple[str | None, float]:
@@ -229,6 +231,8 @@ def not_testable(scanner: Scanner, ranking: Ranking, model: GyroModel, sized: It
     seen = {name for name, energy in result.energy.items() if _is_sized(name, energy)} - set(sized)
     seen |= {name for name in scanner.bank.scans if name not in result.energy}
     reasons |= dict.fromkeys(seen, "too few samples: no size of it would be told")
+    if scanner.lines and (highest := scanner.lines.frequencies[-1]) < WHOLE * 0.5 / scanner.record.interval:
+        reasons["bias_periodic"] = f"above {highest:.3g} Hz: beside gaps as long as these no faster lines are searched"
     return reasons | {
         name: "cannot be told from what the model already has on this campaign"
         for name in tried - skipped(model, scanner.record.signals) - set(sized)
