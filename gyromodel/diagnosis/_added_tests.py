@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 from gyromodel._checks import accelerations, along_axes, thermometers
 from gyromodel.attitude import COLUMNS
 from gyromodel.campaign import Campaign
-from gyromodel.diagnosis._drivers import NOT_DRIVERS
+from gyromodel.diagnosis._drivers import NOT_DRIVERS, proportion
 from gyromodel.effects.geometry import cross_rates
 from gyromodel.units import from_internal
 
@@ -43,8 +43,9 @@ def added_tests(campaign: Campaign) -> Iterator[AddedTest]:
     yield from _turned(campaign, cross_rates(campaign.columns))
     if "rate" in campaign.columns and np.ptp(campaign.columns["rate"]) > 0 and not _at_rest(campaign):
         rate = campaign.columns["rate"]
-        yield AddedTest("Run the same rates with their signs reversed.", _with(campaign, rate=-rate))
-        yield AddedTest("Run the same rates in the opposite order.", _with(campaign, rate=rate[::-1]))
+        for sentence, rates in (("with their signs reversed", -rate), ("in the opposite order", rate[::-1])):
+            moved = _in_proportion(campaign, "rate", rates) | {"rate": rates}
+            yield AddedTest(f"Run the same rates {sentence}.", _with(campaign, **moved))
     if "azimuth" in campaign.columns:
         turned = campaign.columns["azimuth"] + from_internal(np.pi / 2, campaign.units["azimuth"])
         yield AddedTest("Turn the gyro by 90° in azimuth and repeat.", _with(campaign, azimuth=turned))
@@ -135,7 +136,15 @@ def _thermal(campaign: Campaign) -> Iterator[AddedTest]:
             # Its logarithm bends little over temperature.
             logs = np.log(np.maximum(campaign.columns[RESISTANCE], np.finfo(float).tiny))
             others[RESISTANCE] = np.exp(np.polynomial.Polynomial.fit(values, logs, 3)(history))
-        yield AddedTest(sentence, _with(campaign, temperature=history, **others))
+        moved = _in_proportion(campaign, "temperature", history) | others | {"temperature": history}
+        yield AddedTest(sentence, _with(campaign, **moved))
+
+
+def _in_proportion(campaign: Campaign, name: str, values: np.ndarray) -> dict[str, np.ndarray]:
+    """The columns that went with another in proportion, as they go where it has other values: nothing parts them."""
+    others = [n for n in campaign.covariates if n != name and n not in NOT_DRIVERS]
+    lines = {n: line for n in others if (line := proportion(campaign.columns[name], campaign.columns[n])) is not None}
+    return {n: line[0] * values + line[1] for n, line in lines.items()}
 
 
 def _with(campaign: Campaign, **columns: np.ndarray) -> Campaign:

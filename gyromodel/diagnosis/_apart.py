@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy import stats
 
 from gyromodel.diagnosis._forms import form_effect
 from gyromodel.diagnosis._ranking import Ranking, is_driver
 from gyromodel.diagnosis._scan import Scanner
+from gyromodel.estimate import Estimate, filter_of, whiten_columns
 from gyromodel.model import effect_class
 
 # Candidates whose sums of squares differ by less than this part of the noise variance have the same signal …
@@ -17,6 +19,8 @@ ALIKE = 0.2
 CLOSE = 2.0
 # … where their columns lie no farther apart than this sine: among many lines one explains as much by chance.
 HELD = 0.5
+# Chance below which a size shows, and part of what an effect explains that one sample alone may tell.
+NOTHING_SHOWS, ONE_SAMPLE = 0.05, 0.8
 
 
 def twins(scanner: Scanner, ranking: Ranking, name: str, alike: float = ALIKE) -> set[str]:
@@ -91,3 +95,30 @@ def separation(scanner: Scanner, ranking: Ranking, a: str, b: str) -> float | No
 def _basis(x: np.ndarray) -> np.ndarray:
     u, s, _ = np.linalg.svd(x / np.maximum(np.linalg.norm(x, axis=0), 1e-300), full_matrices=False)
     return u[:, s > 1e-5]
+
+
+def shows(estimate: Estimate, name: str) -> bool:
+    """Whether the coefficients of an effect, taken together, differ from zero in a fit (5 %)."""
+    linear = _linear(estimate, name)
+    if not linear:
+        return True
+    sizes, covariance = np.asarray(estimate.model.vector())[linear], estimate.covariance[np.ix_(linear, linear)]
+    return bool(stats.chi2.sf(sizes @ np.linalg.pinv(covariance, hermitian=True) @ sizes, len(linear)) < NOTHING_SHOWS)
+
+
+def rests_on_one(estimate: Estimate, name: str) -> bool:
+    """Whether one sample tells nearly all of an effect that the rest of a fitted model leaves."""
+    linear, record = _linear(estimate, name), estimate.record
+    if not linear:
+        return False
+    columns = np.asarray(estimate.model.linearise(record.signals)[1])
+    white = np.asarray(whiten_columns(filter_of(record, estimate.ratios), columns))[: record.rows][record.present]
+    own, others = white[:, linear] @ np.asarray(estimate.model.vector())[linear], np.delete(white, linear, axis=1)
+    left = (own - others @ np.linalg.lstsq(others, own, rcond=1e-10)[0]) ** 2
+    return bool(left.max() > ONE_SAMPLE * left.sum())
+
+
+def _linear(estimate: Estimate, name: str) -> list[int]:
+    """The places of an effect's free coefficients among a model's parameters."""
+    model = estimate.model
+    return [i for i, slot in enumerate(model.slots()) if slot.linear and model.labels[slot.effect] == name]

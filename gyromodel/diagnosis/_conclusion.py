@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gyromodel.diagnosis._extended import finished, stated_counts, stated_hops, stated_level
+from gyromodel.diagnosis._extended import finished, louder, stated_counts, stated_hops, stated_level
 from gyromodel.diagnosis._isolation import settling_test
 from gyromodel.diagnosis._judgement import Judgement, structured, undecided, with_noise, with_steps
 from gyromodel.diagnosis._misfit import excess_band
@@ -89,6 +89,8 @@ def conclude(found: Searched, hold_out: bool) -> Conclusion:
         baseline = with_reading(baseline, found.reading, found.given, found.record)
     if counts and last.noise_given:
         extended = stated_counts(extended, counts)
+    if times := noise_level(last):
+        extended = louder(extended, times)
     extended = _with_noise_stated(found, extended)
     return Conclusion(_in_doubt(found, judgement, baseline, extended), baseline, extended, coarse, ordinary)
 
@@ -100,7 +102,9 @@ def _remarks(found: Searched) -> None:
     findings += held_back(last, found.given)
     # What rounding leaves is larger at edges of steps, where there is much more to tell than tails.
     left = () if found.rounding.saw_tooth else (tails(last), dwells_apart(last, found.data.unit))
-    findings += [line for line in (*left, noise_level(last)) if line]
+    findings += [line for line in left if line]
+    if times := noise_level(last):
+        findings.append(f"The noise is {times:.3g} times as large as the model states: the extended model states that.")
     stated, slope = float(found.model.gain()), float(last.model.gain())
     if slope * (stated if np.isfinite(stated) else 1.0) < 0:
         findings.append(

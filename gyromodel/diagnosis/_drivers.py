@@ -19,6 +19,8 @@ RESPONSE_DRIVER, RECOVERY_DRIVER = f"smooth({RATE_OF.format('rate')})", f"smooth
 # A current of which this part follows the output's noise is the output, if it is so many over the root of the samples:
 # four standard errors, as neighbouring second differences of noise are alike. How many times their median are no jump.
 ALIKE, CERTAIN, NO_JUMP = 0.1, 5.6, 4.0
+# Two columns are one where a line leaves less than this part of the variance.
+ONE_LINE = 1e-8
 # What `compensate` adds is the output itself; every function of the ramp's code is bias_readout_code.
 NOT_DRIVERS = ("time", "output", *NUMBERED, "feedback_ramp", "rate_estimated", "rate_estimated_std")
 
@@ -39,6 +41,17 @@ def unusable(record: Record, name: str) -> str:
     if name == "torquer_current" and _is_output(record, name):
         return f"{name} has the output's own noise: it is the output, in another unit"
     return ""
+
+
+def proportion(one: np.ndarray, other: np.ndarray) -> tuple[float, float] | None:
+    """Slope and offset of a column that goes with another in proportion, where both are known; none if it does not."""
+    known = np.isfinite(one) & np.isfinite(other)
+    x, y = one[known], other[known]
+    if len(x) < 3 or not (np.ptp(x) > 0 and np.ptp(y) > 0):
+        return None
+    slope = float((x - x.mean()) @ y / np.sum((x - x.mean()) ** 2))
+    offset = float(y.mean() - slope * x.mean())
+    return (slope, offset) if np.var(y - slope * x - offset) < ONE_LINE * np.var(y) else None
 
 
 def _is_output(record: Record, name: str) -> bool:

@@ -47,6 +47,13 @@ def stated_hops(estimate: Estimate, hops: Cause) -> Estimate:
     return replace(estimate, model=replace(estimate.model, noise=noise), noise_interval=intervals)
 
 
+def louder(estimate: Estimate, times: float) -> Estimate:
+    """The fit in stated noise with all of it so many times as large as its model states."""
+    noise = {k: v if k in (MARKOV_TIME, *TELEGRAPH_TIMES) else v * times for k, v in estimate.model.noise.items()}
+    interval = {k: (low * times, high * times) for k, (low, high) in estimate.noise_interval.items()}
+    return replace(estimate, model=replace(estimate.model, noise=noise), noise_interval=interval)
+
+
 def stated_level(estimate: Estimate, grows: Growth, level: Level) -> Estimate:
     """The fit with what its noise level follows as its model states it."""
     model, more = with_level(estimate.model, level)

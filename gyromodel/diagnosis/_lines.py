@@ -25,6 +25,8 @@ LOWEST_LINES, SPACED_LINES, HIGHEST_LINES, PEAKS, PEAK_WIDTH = 24, 24, 12, 12, 6
 RESOLVED = 4
 # Places in time that a record's samples stand at, at most.
 MOST_PLACES = 2**18
+# Steps from sample to sample are uneven where most lie this part of the usual one apart.
+UNEVEN = 0.3
 # Fewer cycles in the record than this are a trend, not a line.
 FEWEST_CYCLES = 1.5
 
@@ -145,6 +147,13 @@ def _highest(interval: float, span: float) -> float:
     return 0.5 / interval - 0.49 / (span + interval)
 
 
+def _uneven(record: Record) -> bool:
+    """Whether samples stand so unevenly that a line and its alias at the mean sample rate look different."""
+    step = np.asarray(record.sampling.interval)[: record.rows][~np.asarray(record.sampling.restart)[: record.rows]]
+    low, high = np.quantile(step, [0.1, 0.9]) if len(step) else (0.0, 0.0)
+    return bool(high - low > UNEVEN * record.interval)
+
+
 def line_grid(record: Record) -> LineGrid | None:
     """A quarter of the record's resolution, up to half the sample rate; None where that leaves no frequency."""
     time = np.asarray(record.signals["time"])
@@ -152,9 +161,12 @@ def line_grid(record: Record) -> LineGrid | None:
     time = time - time[np.searchsorted(record.run, record.run)]
     span = record.span
     grid = record.interval
+    share = 1.0
     if np.abs(time[: record.rows] / grid - np.round(time[: record.rows] / grid)).max() > 0.1:
         grid /= 4.0
-    fastest = _highest(record.interval, span)
+        # What regular times fold, uneven ones tell apart.
+        share = 0.5 if _uneven(record) else 1.0
+    fastest = _highest(share * record.interval, span)
     if grid < span / MOST_PLACES:
         # Beside long gaps times are rounded to the grid, which slow lines hardly feel.
         grid = span / MOST_PLACES
@@ -173,7 +185,7 @@ def line_grid(record: Record) -> LineGrid | None:
     each = (time[: record.rows][run[: record.rows] == r] for r in range(run[-1] + 1))
     runs = [(float(np.median(np.diff(own))) if len(own) > 1 else record.interval, float(np.ptp(own))) for own in each]
     unseen = [
-        (frequencies * (lasting + 1e-9 * span) < FEWEST_CYCLES) | (frequencies > _highest(step, lasting))
+        (frequencies * (lasting + 1e-9 * span) < FEWEST_CYCLES) | (frequencies > _highest(share * step, lasting))
         for step, lasting in runs
     ]
     # A quarter of a run's resolution apart, which is more than one step of the grid for runs shorter than the longest.

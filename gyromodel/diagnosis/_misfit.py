@@ -106,7 +106,7 @@ def unsteady_lines(estimate: Estimate) -> list[bool]:
         bends = legvander(2 * (time - begin) / (end - begin) - 1, BENDS)[:, 1:] * within[:, None]
         wave = np.exp(2j * np.pi * line.frequency * time)[:, None] * bends
         bent += [wave.real, wave.imag]
-        beat = (0.5 / record.interval - line.frequency) * (end - begin)
+        beat = abs(0.5 / record.interval - line.frequency) * (end - begin)
         alternating.append(bool(beat < ALTERNATING))
     jacobian = np.asarray(model.linearise(record.signals)[1])
     p = jacobian.shape[1]
@@ -134,7 +134,7 @@ def changed(record: Record, frequencies: list[float], weaker: list[float]) -> st
     fastest = 0.5 / record.interval
     said = f"What oscillates near {places} Hz changes its size or its frequency: no steady line, and not named."
     said += f" Nor is what oscillates more weakly near {others} Hz." if weaker else ""
-    if (fastest - max(frequencies)) * record.span < ALTERNATING:
+    if min(abs(fastest - line) for line in frequencies) * record.span < ALTERNATING:
         said += (
             f" {fastest:.4g} Hz is half the sample rate: there the output alternates from one sample to the next, by "
             "an amount that may change. Faster lines that sampling folds, or a converter, do so: log at another rate."

@@ -7,9 +7,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from scipy.stats import binom
 
-from gyromodel._checks import listed
+from gyromodel._checks import listed, thermometers
 from gyromodel.campaign import Campaign
-from gyromodel.diagnosis._drivers import RECOVERY_DRIVER
+from gyromodel.diagnosis._drivers import RECOVERY_DRIVER, driver_names, kind_of, proportion
 from gyromodel.diagnosis._evidence import log_sum
 from gyromodel.diagnosis._lines import lines_of
 from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise, special_cases
@@ -25,6 +25,7 @@ from gyromodel.effects.geometry import Misalignment, TableHarmonic
 from gyromodel.effects.thermometer import TemperatureLag
 from gyromodel.estimate import Estimate
 from gyromodel.model import effect_class
+from gyromodel.signals import Record
 
 # Parts of an interval by which samples may be off a regular grid before they tell a line from its aliases.
 IRREGULAR = 0.01
@@ -95,7 +96,8 @@ def told_of_cause(steps: Steps, step: Found, extended: Estimate, known: set[str]
     if name == "scale_factor":
         yield "A scale error of the rate table would look the same: check it against a second reference."
     late = [e.late for e in extended.model.effects if isinstance(e, TemperatureLag) and e.label == name]
-    yield from (f"Of thermometer and coil the {part} is late." for part in late)
+    yield from (f"As {name} it is the {part} that is late, of thermometer and coil." for part in late)
+    yield from _of_columns(steps.scanner.record, step.effect)
     orders = [o for e in extended.model.effects if isinstance(e, TableHarmonic) and e.label == name for o in e.orders]
     yield from [f"It returns {listed([str(o) for o in orders])} times a turn of the table."] if orders else []
     for effect in (e for e in extended.model.effects if e.label == name):
@@ -112,6 +114,20 @@ def told_of_cause(steps: Steps, step: Found, extended: Estimate, known: set[str]
         yield f"Of the evidence for {name}, {odds:.1f} nats are prior odds: every gyro has one."
     if close := _close_rival(step, known):
         yield close
+
+
+def _of_columns(record: Record, effect: Effect | None) -> Iterator[str]:
+    """Which thermometers an effect is of, where there are several, and which columns may stand for its own."""
+    own = effect.columns_needed if effect is not None else ()
+    if effect is not None and len(thermometers(record.signals)) > 1 and (of := thermometers(own)):
+        yield f"Of {effect.label} this is with {listed(of)}."
+    for a in own:
+        for b in driver_names(record):
+            if b in own or a not in record.signals or kind_of(record, a) != kind_of(record, b):
+                continue
+            one, other = (np.asarray(record.signals[n])[: record.rows][record.present] for n in (a, b))
+            if proportion(one, other) is not None:
+                yield f"{a} and {b} go in proportion here: which of them it follows, this campaign cannot tell."
 
 
 def told_of_walk(steps: Steps, last: Ranking) -> Iterator[str]:

@@ -223,11 +223,7 @@ def _weighted(found: Searched, say: Say) -> None:
     if grows is None or others is None:
         return
     found.grows, (found.session, found.selection) = grows, others
-    times = max(grows.ratio, 1.0 / grows.ratio)
-    found.findings.append(
-        f"The noise level follows {grows.driver}, {times:.3g} times as large at one end as at the other; samples "
-        "are weighted accordingly."
-    )
+    found.findings.append(grows.told(found.record))
     found.following = follow(found.selection.estimate, grows)
     if found.following:
         found.findings.append(found.following)

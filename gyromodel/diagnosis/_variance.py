@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from gyromodel._checks import thermometers
+from gyromodel._checks import listed, thermometers
 from gyromodel._noise_level import FORMS
 from gyromodel.campaign import Campaign
 from gyromodel.declarations import RATE_OF
@@ -38,24 +38,27 @@ FEWEST_REPEATS, CHANCE, MOST_REPEATS = 4, 1e-4, 0.5
 JUMP = 2.0
 
 
+CAMPAIGN = "campaign"
 LABELS = {"rate": "|rate|", "temperature": "temperature", "temperature_rate": "|temperature rate|", "time": "time"}
 
 
 def variance_drivers(record: Record) -> dict[str, np.ndarray]:
-    """What the noise may grow with, each scaled to 0…1."""
+    """What the noise may grow with, each scaled to 0…1; of several campaigns a column for each but the first."""
     found = {}
     for name, label in LABELS.items():
         if name in record.signals:
             values = FORMS[name](np.asarray(record.signals[name]))
             inside = values[: record.rows]
             if np.isfinite(inside).all() and np.ptp(inside) > 0:
-                found[label] = (values - inside.min()) / np.ptp(inside)
+                found[label] = ((values - inside.min()) / np.ptp(inside))[:, None]
     interval = np.asarray(record.sampling.interval)
     within = ~np.asarray(record.sampling.restart)[: record.rows]
     low, high = np.quantile(interval[: record.rows][within], [0.05, 0.95])
     if high > CHANGED * low:
         # Means over another time have another scatter. Gaps are no interval, nor has a first row one.
-        found["sample interval"] = (np.clip(interval, low, high) - low) / (high - low)
+        found["sample interval"] = ((np.clip(interval, low, high) - low) / (high - low))[:, None]
+    if record.domain == "gyro" and (further := np.arange(1, record.run[-1] + 1)).size:
+        found[CAMPAIGN] = (record.run[:, None] == further).astype(float)
     return found
 
 
@@ -84,6 +87,19 @@ class Growth(NamedTuple):
         values = FORMS[name](np.asarray(record.signals[name])[: record.rows])
         return Level(name, float(values.min()), float(values.max()), self.ratio)
 
+    def told(self, record: Record) -> str:
+        """What the noise level follows, as a sentence."""
+        if self.driver == CAMPAIGN:
+            first = np.unique(record.run[: record.rows], return_index=True)[1]
+            levels = np.sqrt(self.white[first] / self.white[0])
+            said = f"differs from campaign to campaign: it is {listed([f'{level:.3g}' for level in levels])} times that"
+            return f"The noise level {said} of the first, which is told; samples are weighted accordingly."
+        times = max(self.ratio, 1.0 / self.ratio)
+        return (
+            f"The noise level follows {self.driver}, {times:.3g} times as large at one end as at the other; samples "
+            "are weighted accordingly."
+        )
+
 
 def growing_noise(record: Record, estimate: Estimate) -> Growth | None:
     """The driver that the noise level follows most; None where it follows none, or there is none but rounding."""
@@ -92,50 +108,62 @@ def growing_noise(record: Record, estimate: Estimate) -> Growth | None:
     use = np.isfinite(estimate.whitened)
     # Large residuals are shortened, so that a few gross errors do not pass for a trend.
     e = np.minimum(estimate.whitened[use] ** 2, 9.0)
-    best: tuple[float, str, np.ndarray] | None = None
+    e = e - e.mean()
+    best: tuple[float, float, str, np.ndarray] | None = None
     drivers = variance_drivers(record)
     for label, z in drivers.items():
         x = z[: record.rows][use]
-        varies = e.std() > 0 and np.ptp(x) > 0
-        statistic = np.corrcoef(x, e)[0, 1] ** 2 * len(e) if varies else 0.0
-        if best is None or statistic > best[0]:
-            best = (statistic, label, z)
-    if best is None or stats.chi2.sf(best[0], 1) * len(drivers) > SIGNIFICANT:
+        x = x - x.mean(axis=0)
+        explained = x @ np.linalg.lstsq(x, e, rcond=1e-10)[0]
+        statistic = len(e) * float(explained @ explained) / max(float(e @ e), 1e-300)
+        chance = float(stats.chi2.logsf(statistic, max(np.linalg.matrix_rank(x), 1)))
+        if best is None or chance < best[0]:
+            best = (chance, statistic, label, z)
+    if best is None or best[0] + np.log(len(drivers)) > np.log(SIGNIFICANT):
         return None
-    x = best[2][: record.rows][use]
-    slope, fitted, alone = 0.0, estimate, np.asarray(record.sampling.white)
-    white, changes = alone, list[float]()
+    z = np.clip(best[3], 0.0, 1.0)
+    x = z[: record.rows][use]
+    slope, fitted, alone = np.zeros(x.shape[1]), estimate, np.asarray(record.sampling.white)
+    white, changes = alone, list[np.ndarray]()
+    # Of a column the level is told halfway along it, of campaigns that of the first.
+    middle = np.full(len(slope), 0.5 * (best[2] != CAMPAIGN))
     # Slow noise, which does not grow, is a part of the quiet samples' scatter: in turns.
     for turn in range(TURNS):
-        changes.append(_log_slope(x, fitted.whitened[use] ** 2))
-        slope = float(np.clip(slope + changes[-1], -STEEPEST, STEEPEST))
-        white = alone * np.exp(slope * (np.clip(best[2], 0.0, 1.0) - 0.5))
-        if np.abs(changes[-1]) < SETTLED or turn == TURNS - 1:
+        changes.append(_log_slopes(x, fitted.whitened[use] ** 2))
+        slope = np.clip(slope + changes[-1], -STEEPEST, STEEPEST)
+        white = alone * np.exp((z - middle) @ slope)
+        if np.abs(changes[-1]).max() < SETTLED or turn == TURNS - 1:
             break
         try:
             data = with_variance(estimate.record, white)
             fitted = fit_record(data, replace(estimate.model, noise={}), start=estimate.ratios)
         except EstimateError:
             break
-    ratio = float(np.exp(0.5 * slope))
+    # Along a column, or from the quietest campaign to the loudest.
+    along = np.ones(1)
+    if best[2] == CAMPAIGN:
+        each = np.vstack([np.zeros(len(slope)), np.eye(len(slope))])
+        along = each[(each @ slope).argmax()] - each[(each @ slope).argmin()]
+    ratio = float(np.exp(0.5 * along @ slope))
     # A turn makes up as much of what the slope lacks as scatter is white, and only that part of it tells the slope.
-    share = 1.0 - np.clip(changes[1] / changes[0], 0.0, 0.9) if len(changes) > 1 else 1.0
-    std = ratio * float(np.sqrt(0.5 / np.sum((x - x.mean()) ** 2)) / share)
-    evidence = 0.5 * (best[0] - np.log(len(e))) - np.log(len(drivers))
-    return Growth(best[1], white, ratio, std, float(evidence))
+    share = 1.0 - np.clip((along @ changes[1]) / (along @ changes[0]), 0.0, 0.9) if len(changes) > 1 else 1.0
+    x = x - x.mean(axis=0)
+    std = ratio * float(np.sqrt(0.5 * along @ np.linalg.pinv(x.T @ x) @ along) / share)
+    evidence = 0.5 * (best[1] - len(slope) * np.log(len(e))) - np.log(len(drivers))
+    return Growth(best[2], white, ratio, std, float(evidence))
 
 
-def _log_slope(x: np.ndarray, square: np.ndarray) -> float:
-    """Slope of ln σ² on x by iterated gamma regression."""
-    design = np.column_stack([np.ones_like(x), x])
-    beta = np.array([np.log(square.mean()), 0.0])
+def _log_slopes(x: np.ndarray, square: np.ndarray) -> np.ndarray:
+    """Slopes of ln σ² on some columns by iterated gamma regression."""
+    design = np.column_stack([np.ones(len(x)), x])
+    beta = np.append(np.log(square.mean()), np.zeros(x.shape[1]))
     for _ in range(50):
         mean = np.exp(np.clip(design @ beta, -30, 30))
         step = np.linalg.lstsq(design, np.minimum(square, 16 * mean) / mean - 1.0, rcond=None)[0]
         beta = beta + np.clip(step, -1, 1)
         if np.abs(step).max() < 1e-6:
             break
-    return float(np.clip(beta[1], -STEEPEST, STEEPEST))
+    return np.clip(beta[1:], -STEEPEST, STEEPEST)
 
 
 def with_variance(record: Record, white: np.ndarray) -> Record:
@@ -229,8 +257,8 @@ def thermometers_still(campaign: Campaign) -> list[str]:
     return said
 
 
-def noise_level(estimate: Estimate) -> str | None:
-    """A sentence where the residuals' level contradicts the noise that the model states."""
+def noise_level(estimate: Estimate) -> float | None:
+    """How many times as large as the model states the noise is, where the residuals contradict that; else none."""
     if not estimate.noise_given:
         return None
     gain = float(estimate.model.gain())
@@ -239,7 +267,4 @@ def noise_level(estimate: Estimate) -> str | None:
     ratio = estimate.white_variance / stated
     if 2 * min(stats.chi2.sf(nu * ratio, nu), stats.chi2.cdf(nu * ratio, nu)) > CONTRADICTED:
         return None
-    return (
-        f"The noise is {np.sqrt(ratio):.3g} times as large as the model states; uncertainties are those of "
-        "the level in the data."
-    )
+    return float(np.sqrt(ratio))

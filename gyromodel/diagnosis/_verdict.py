@@ -9,7 +9,7 @@ import numpy as np
 
 from gyromodel._checks import thermometers
 from gyromodel.campaign import Campaign
-from gyromodel.diagnosis._apart import like, twins
+from gyromodel.diagnosis._apart import like, rests_on_one, shows, twins
 from gyromodel.diagnosis._beside import UNKNOWN_EVIDENCE
 from gyromodel.diagnosis._causes import cause_of
 from gyromodel.diagnosis._drivers import smooth_columns
@@ -36,6 +36,8 @@ NO_EDGE = ("bias_drift", "bias_warmup")
 FAINT, OUTDONE = 10.0, 10.0
 # What makes lines at each harmonic of a ramp, of which its form holds a few.
 CODES = "bias_readout_code"
+# Dwells of a series that may be anomalous each for itself: so many, or this part of all.
+FEW_APART, MANY_APART = 4, 0.1
 # A driver that names leave with more than this share of the structure makes the discrepancy unknown.
 UNKNOWN_SHARE = 0.05
 
@@ -118,6 +120,7 @@ def judge(
         causes.append(replace(cause, places=places(sorted(step.points), searched)) if step.points else cause)
         sets.append(members)
     sets = _with_doubts(causes, sets, extended)
+    named_too = [c for c in causes if c.points or is_noise(c.effect) or shows(extended, c.effect)]
     # Dwells of a series that are anomalous hide nothing else.
     aside = [c.effect == "outliers" and not scanner.by_points for c in causes]
     order = sorted(range(len(causes)), key=lambda i: (aside[i], -causes[i].statistic))
@@ -147,17 +150,24 @@ def judge(
             findings.append(
                 "Sizes of names beside it are fitted with what has no name as noise, as their uncertainties say."
             )
-        return judged("unknown", causes, {driver: 1.0}, driver=driver, next_test=test_of_driver(driver))
+        return judged("unknown", named_too, {driver: 1.0}, driver=driver, next_test=test_of_driver(driver))
     if not saw_tooth and _outweighed(effects, selection, scanner.record.domain):
         # A name holds less of what is there than it leaves, in a form that it cannot have; or all of them do.
         driver, score = last.best(drivers=True)
         driver = driver if score > steps.threshold else None
-        return judged("unknown", causes, {driver or str(selection.remains): 1.0}, driver=driver)
+        return judged("unknown", named_too, {driver or str(selection.remains): 1.0}, driver=driver)
     # Single gross errors are no cause, however many of them a search did not come to.
     if not effects and selection.remains and not saw_tooth and (scanner.by_points or selection.remains != "outliers"):
         return judged("unknown", causes, {selection.remains: 1.0})
     if not causes:
         return judged("adequate", (), {})
+    apart = sum(len(scanner.points_among(c.points)) for c in causes if c.effect == "outliers")
+    if not scanner.by_points and apart > max(FEW_APART, MANY_APART * len(scanner.points)):
+        findings.append(
+            f"{apart} of {len(scanner.points)} dwells stand apart from all that was found: so many are no gross errors."
+        )
+        test = "Repeat these dwells in another order: gross errors do not come back, what the gyro does there does."
+        return judged("unknown", causes, {"outliers": 1.0}, next_test=test)
     named = [c for c, s in zip(causes, sets, strict=True) if len(s) == 1]
     doubt = _left_open(sets, {c.effect for c in named})
     for i, (cause, members) in enumerate(zip(causes, sets, strict=True)):
@@ -209,6 +219,8 @@ def _members(
             return members if scanner.by_points or bad.any() else {}
         own = {k: 0.5 * share for k, share in members.items()}
         members = own | {k: 0.5 / len(rivals) + own.get(k, 0.0) for k in rivals}
+    if step.effect is not None and name not in SLOW_IN_TIME and rests_on_one(extended, name):
+        members = {k: 0.5 * share for k, share in members.items()} | {"outliers": 0.5}
     if isinstance(step.effect, BiasPeriodic) and of_rounding(extended):
         members = {k: 0.5 * share for k, share in members.items()} | {"noise_quantisation": 0.5}
     if saw_tooth and step.points and no_farther(extended, step.points, saw_tooth):
@@ -228,9 +240,19 @@ def _with_doubts(
     shared = dict.fromkeys(vague, 1.0 / len(vague)) if len(vague) > 1 else {}
     together = [s | shared if c.effect in vague else s for c, s in zip(causes, sets, strict=True)]
     return [
-        members | _left_by(c, causes, extended, c.effect in vague) if len(members) == 1 else members
+        members | (_left_by(c, causes, extended, c.effect in vague) or _of_slow_noise(c, extended))
+        if len(members) == 1
+        else members
         for c, members in zip(causes, together, strict=True)
     ]
+
+
+def _of_slow_noise(cause: Cause, estimate: Estimate) -> dict[str, float]:
+    """The slow noise that may be all of a cause which has no size beside it that shows."""
+    slow = float(estimate.ratios.walk), float(estimate.ratios.flicker)
+    if cause.points or is_noise(cause.effect) or not any(slow) or shows(estimate, cause.effect):
+        return {}
+    return {"noise_random_walk" if slow[0] else "noise_flicker": 0.5}
 
 
 def _outweighed(causes: Sequence[Cause], selection: Selection, domain: str) -> bool:
