@@ -217,6 +217,7 @@ def _together(campaigns: Sequence[Campaign]) -> Campaign:
         for name in names:
             columns[name].append(campaign.in_unit(name, first.units[name]))
     units = {n: first.units[n] for n in columns}
-    whole = Campaign({n: np.concatenate(v) for n, v in columns.items()}, units, first.metadata, first.name)
+    named = f"{first.name} and {campaigns[1].name if len(campaigns) == 2 else f'{len(campaigns) - 1} more'}"
+    whole = Campaign({n: np.concatenate(v) for n, v in columns.items()}, units, first.metadata, named)
     number = np.repeat(1.0 + np.arange(len(campaigns)), [len(c) for c in campaigns])
     return whole if "campaign" in names else whole.with_column("campaign", number, "")

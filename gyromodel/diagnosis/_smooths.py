@@ -218,7 +218,7 @@ def _measures(record: Record, name: str, values: np.ndarray) -> bool:
     """Whether a thermometer shows some values and its noise, which second differences tell."""
     shown = np.asarray(record.signals[name])[: record.rows]
     noise = np.mean(np.diff(shown, 2) ** 2) / 6.0 / np.var(shown)
-    if kind_of(record, name) != "temperature" or not noise < MOSTLY_NOISE:
+    if kind_of(record, name) != "temperature" or not noise < MOSTLY_NOISE or not np.ptp(values) > 0:
         return False
     return bool(np.corrcoef(shown, values)[0, 1] ** 2 > WARMED * (1.0 - noise))
 
