@@ -120,7 +120,7 @@ def _of_columns(record: Record, effect: Effect | None) -> Iterator[str]:
     """Which thermometers an effect is of, where there are several, and which columns may stand for its own."""
     own = effect.columns_needed if effect is not None else ()
     if effect is not None and len(thermometers(record.signals)) > 1 and (of := thermometers(own)):
-        yield f"Of {effect.label} this is with {listed(of)}."
+        yield f"The thermometer{'s' * (len(of) > 1)} of {effect.label}: {listed(of)}."
     for a in own:
         for b in driver_names(record):
             if b in own or a not in record.signals or kind_of(record, a) != kind_of(record, b):
