@@ -153,7 +153,7 @@ def test_a_late_coil_beside_stated_noise_leaves_no_noise_lacking():
     model = gm.model_from_effects(["bias", "bias_temperature_curve"])
     found = gm.diagnose(campaign, GyroModel(model.effects, noise), hold_out=False)
     assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["temperature_lag"])
-    assert "Of thermometer and coil the coil is late." in found.findings
+    assert "As temperature_lag it is the coil that is late, of thermometer and coil." in found.findings
 
 
 def test_a_late_coil_is_written_and_read(tmp_path):
