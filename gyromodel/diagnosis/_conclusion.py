@@ -89,7 +89,7 @@ def conclude(found: Searched, hold_out: bool) -> Conclusion:
         baseline = with_reading(baseline, found.reading, found.given, found.record)
     if counts and last.noise_given:
         extended = stated_counts(extended, counts)
-    if times := noise_level(last):
+    elif times := noise_level(last):
         extended = louder(extended, times)
     extended = _with_noise_stated(found, extended)
     return Conclusion(_in_doubt(found, judgement, baseline, extended), baseline, extended, coarse, ordinary)

@@ -92,8 +92,11 @@ class Growth(NamedTuple):
         if self.driver == CAMPAIGN:
             first = np.unique(record.run[: record.rows], return_index=True)[1]
             levels = np.sqrt(self.white[first] / self.white[0])
-            said = f"differs from campaign to campaign: it is {listed([f'{level:.3g}' for level in levels])} times that"
-            return f"The noise level {said} of the first, which is told; samples are weighted accordingly."
+            times = listed([f"{level:.3g}" for level in levels])
+            return (
+                f"The noise level differs from campaign to campaign, {times} times that of the first, which is the one "
+                "told; samples are weighted accordingly."
+            )
         times = max(self.ratio, 1.0 / self.ratio)
         return (
             f"The noise level follows {self.driver}, {times:.3g} times as large at one end as at the other; samples "

@@ -249,10 +249,11 @@ def _with_doubts(
 
 def _of_slow_noise(cause: Cause, estimate: Estimate) -> dict[str, float]:
     """The slow noise that may be all of a cause which has no size beside it that shows."""
-    slow = float(estimate.ratios.walk), float(estimate.ratios.flicker)
-    if cause.points or is_noise(cause.effect) or not any(slow) or shows(estimate, cause.effect):
+    of = {"noise_random_walk": "walk", "noise_flicker": "flicker", "noise_markov": "markov"}
+    slow = [name for name, ratio in of.items() if float(getattr(estimate.ratios, ratio)) > 0]
+    if cause.points or is_noise(cause.effect) or not slow or shows(estimate, cause.effect):
         return {}
-    return {"noise_random_walk" if slow[0] else "noise_flicker": 0.5}
+    return {slow[0]: 0.5}
 
 
 def _outweighed(causes: Sequence[Cause], selection: Selection, domain: str) -> bool:
