@@ -60,7 +60,7 @@ def diagnose_axes(
         written += [f"{axis}/{report}" for report in REPORTS]
     if not axes:
         raise CampaignError(f"no axis can be diagnosed; {'; '.join(f'{a}: {why}' for a, why in not_diagnosed.items())}")
-    for axis in set(AXES) - set(axes):
+    for axis in not_diagnosed:
         _remove_results(output / axis, model)
     for axis, reason in not_diagnosed.items():
         print(f"gyromodel: axis {axis} was not diagnosed: {reason}", file=sys.stderr)

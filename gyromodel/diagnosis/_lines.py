@@ -148,10 +148,14 @@ def _highest(interval: float, span: float) -> float:
 
 
 def _uneven(record: Record) -> bool:
-    """Whether samples stand so unevenly that a line and its alias at the mean sample rate look different."""
-    step = np.asarray(record.sampling.interval)[: record.rows][~np.asarray(record.sampling.restart)[: record.rows]]
+    """Whether samples of one run stand so unevenly that a line and its alias at the mean sample rate look different.
+
+    Most steps are then no multiples of the usual one, which several clocks, or bursts of one, are.
+    """
+    step = np.asarray(record.sampling.interval)[1 : record.rows] / record.interval
     low, high = np.quantile(step, [0.1, 0.9]) if len(step) else (0.0, 0.0)
-    return bool(high - low > UNEVEN * record.interval)
+    off = np.median(np.abs(step - np.round(step))) if len(step) else 0.0
+    return bool(record.run[-1] == 0 and high - low > UNEVEN and off > 0.1)
 
 
 def line_grid(record: Record) -> LineGrid | None:
