@@ -23,9 +23,9 @@ ROOT = Path(__file__).resolve().parents[1]
 CACHE = ROOT / ".cache"
 # Whose tests hold what a search tells of one campaign, or of a few: not of each draw.
 VERDICTS = {f"test_{name}" for name in (
-    "archive_effects", "diagnosis", "held_out", "honesty", "isolation", "memory_effects", "misfit", "monitors",
-    "motion_effects", "noise_causes", "noise_identification", "platform_diagnosis", "poses", "report", "ring_laser",
-    "rounded_sweeps", "temperature_curves", "thermometer_noise", "three_axes", "unlisted",
+    "archive_effects", "diagnosis", "doubts", "held_out", "honesty", "isolation", "memory_effects", "misfit",
+    "monitors", "motion_effects", "noise_causes", "noise_identification", "platform_diagnosis", "poses", "report",
+    "ring_laser", "rounded_sweeps", "temperature_curves", "thermometer_noise", "three_axes", "twins", "unlisted",
 )}  # fmt: skip
 
 # Whose verdicts are of one draw, the same in each run: they err as often as the threshold allows, which

@@ -11,6 +11,7 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 
 import gyromodel as gm
+from gyromodel.diagnosis._apart import shows
 from gyromodel.effects.scale import ScaleFactor
 from gyromodel.report import sentence
 from gyromodel.report._tables import searched_rows
@@ -36,7 +37,7 @@ def test_a_doubt_beside_a_firm_cause_stays_one_of_the_verdict(rng: np.random.Gen
     """A bias that follows the temperature's rate is one of a late thermometer; one of the supply voltage is neither."""
     model = gm.model_from_effects(["bias", "bias_temperature"])
     right = 0
-    for _ in range(4):
+    for _ in range(8):
         found = gm.diagnose(chamber(rng), model, hold_out=False)
         causes = [cause.effect for cause in found.causes]
         right += (
@@ -51,7 +52,7 @@ def test_a_doubt_beside_a_firm_cause_stays_one_of_the_verdict(rng: np.random.Gen
         assert [told.get(name, "") for name in found.credible_set] == ["possible"] * len(found.credible_set)
         assert "second thermometer at the coil" in (found.next_test or "")
         assert "lacks a bias proportional to supply voltage of (1." in sentence(found)
-    assert binom.cdf(right, 4, 0.97) > 1e-4
+    assert binom.cdf(right, 8, 0.97) > 1e-3
 
 
 def grid(rng: np.random.Generator, null: float) -> gm.Campaign:
@@ -125,11 +126,11 @@ def unit(rng: np.random.Generator, level: float, error: np.ndarray | float = 0.0
 def test_campaigns_of_unlike_noise_hide_nothing(louder: float, rng: np.random.Generator):
     """In one noise for all, the louder one had lines; in two of five draws, firmly."""
     adequate = 0
-    for _ in range(5):
+    for _ in range(10):
         found = gm.diagnose([unit(rng, 1.0), unit(rng, louder)], gm.model_from_effects(["bias"]), hold_out=False)
         adequate += found.verdict == "adequate"
         assert any("differs from campaign to campaign" in line for line in found.findings) == (louder > 1.0)
-    assert binom.cdf(adequate, 5, 0.98) > 1e-4
+    assert binom.cdf(adequate, 10, 0.98) > 1e-3
 
 
 def test_what_all_campaigns_lack_is_weighted_by_their_noise(rng: np.random.Generator):
@@ -146,11 +147,27 @@ def test_what_all_campaigns_lack_is_weighted_by_their_noise(rng: np.random.Gener
 
 def test_an_offset_that_slow_noise_hides_is_no_firm_cause():
     """One of two files begins with a decay that no column explains: a turn-on of (0.06 ± 0.56) deg/h was firm."""
-    rng = np.random.default_rng(0)
-    decay = 1.6 * np.exp(-STEP * np.arange(ROWS) / 900.0)
-    found = gm.diagnose([unit(rng, 0.05, decay), unit(rng, 0.05)], gm.model_from_effects(["bias"]))
-    for cause in found.causes if found.verdict == "named" else ():
-        assert any(abs(p.value) > 2.0 * p.std for p in cause.parameters if p.std)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        decay = 1.6 * np.exp(-STEP * np.arange(ROWS) / 900.0)
+        found = gm.diagnose([unit(rng, 0.05, decay), unit(rng, 0.05)], gm.model_from_effects(["bias"]))
+        assert found.verdict in ("ambiguous", "unknown")
+
+
+@pytest.mark.law
+def test_campaigns_of_two_clocks_are_searched_for_lines_of_the_faster(rng: np.random.Generator):
+    """A line of the slower campaign and its alias: both are even times, so that no frequency is told for sure."""
+    for _ in range(3):
+        logs = []
+        for step, size in ((1.0, 0.0), (2.5, 1.5)):
+            time = step * np.arange(300)
+            output = 3.0 + size * np.cos(2 * np.pi * 0.0733 * time + 1.0) + 0.4 * rng.standard_normal(300)
+            columns = {"time": time, "output": output}
+            logs.append(gm.Campaign(columns, {"time": "s", "output": "deg/h"}, {"kind": "rate"}))
+        found = gm.diagnose(logs, gm.model_from_effects(["bias"]), hold_out=False)
+        for cause in found.causes if found.verdict == "named" else ():
+            told = [p.value for p in cause.parameters if p.name == "frequency"]
+            assert told == pytest.approx([0.0733], abs=1e-3)
 
 
 def test_a_line_that_uneven_times_tell_from_its_alias_is_named(rng: np.random.Generator):
@@ -186,6 +203,35 @@ def test_what_one_sample_tells_may_be_a_gross_error(rng: np.random.Generator):
     found = gm.diagnose(log, gm.model_from_effects(["bias"]), hold_out=False)
     assert found.verdict != "named"
     assert {"outliers", "bias_supply_voltage"} <= set(found.credible_set)
+
+
+@pytest.mark.law
+def test_a_column_that_steps_in_a_random_walk_is_no_gross_error(rng: np.random.Generator):
+    """In a walk a step tells by the one increment at its edge, which no single wrong sample makes."""
+    on = (np.arange(ROWS) > 217).astype(float)
+    named = 0
+    for _ in range(6):
+        walk = np.cumsum(0.02 * rng.standard_normal(ROWS))
+        log = unit(rng, 0.001, 2.0 * on + walk).with_column("supply_voltage", 5.0 + on, "V")
+        found = gm.diagnose(log, gm.model_from_effects(["bias"]), hold_out=False)
+        assert "outliers" not in found.credible_set
+        named += "bias_supply_voltage" in found.credible_set
+    assert binom.cdf(named, 6, 0.95) > 1e-3
+
+
+def test_sizes_show_by_what_differs_from_the_simulation(rng: np.random.Generator):
+    """What a simulation states of a slope is no evidence of one more: its sizes count from there."""
+    temperature = 20.0 + 25.0 * np.sin(np.arange(ROWS) / 50.0)
+    stated = gm.model_from_effects(["bias", "bias_temperature"])
+    for change, there in ((0.0, False), (0.5, True)):
+        found = gm.fit(unit(rng, 0.3, (0.4 + change) * temperature, temperature=temperature), stated)
+        size = float(np.deg2rad(0.4 / 3600.0))
+        effects = tuple(
+            replace(e, coefficient=jnp.asarray(size)) if e.label == "bias_temperature" else e for e in stated.effects
+        )
+        before = replace(stated, effects=effects, fixed=frozenset({("bias_temperature", "coefficient")}))
+        assert shows(found, "bias_temperature", before) is there
+        assert shows(found, "bias_temperature", gm.model_from_effects(["bias"]))
 
 
 def test_the_extended_model_states_the_noise_that_there_is(rng: np.random.Generator):

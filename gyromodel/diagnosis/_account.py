@@ -47,13 +47,8 @@ def as_added(selection: Selection, alike: Mapping[str, float]) -> dict[str, Rank
     return of
 
 
-def p_value_of(selection: Selection, nulls: np.ndarray) -> float | None:
-    """Share of campaigns with nothing hidden whose best candidate has as much evidence; this one is counted.
-
-    None where that is noise beyond what the simulation states, which is not looked for in draws.
-    """
-    if is_noise(selection.first.best(drivers=False)[0] or ""):
-        return None
+def p_value_of(selection: Selection, nulls: np.ndarray) -> float:
+    """Share of campaigns with nothing hidden whose best effect or driver has as much evidence; this one is counted."""
     return float((1 + np.sum(nulls >= selection.first.significance)) / (1 + len(nulls)))
 
 

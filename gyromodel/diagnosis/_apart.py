@@ -11,7 +11,7 @@ from gyromodel.diagnosis._forms import form_effect
 from gyromodel.diagnosis._ranking import Ranking, is_driver
 from gyromodel.diagnosis._scan import Scanner
 from gyromodel.estimate import Estimate, filter_of, whiten_columns
-from gyromodel.model import effect_class
+from gyromodel.model import GyroModel, effect_class
 
 # Candidates whose sums of squares differ by less than this part of the noise variance have the same signal …
 ALIKE = 0.2
@@ -97,25 +97,54 @@ def _basis(x: np.ndarray) -> np.ndarray:
     return u[:, s > 1e-5]
 
 
-def shows(estimate: Estimate, name: str) -> bool:
-    """Whether the coefficients of an effect, taken together, differ from zero in a fit (5 %)."""
+def shows(estimate: Estimate, name: str, before: GyroModel, contained: int = 0) -> bool:
+    """Whether what was added of an effect, taken together, differs in a fit from what the simulation has (5 %).
+
+    Args:
+        estimate: the fit of the extended model.
+        name: the effect.
+        before: the simulation.
+        contained: how many of the effect's coefficients the simulation has, under this or another name.
+    """
+    slots, stated = estimate.model.slots(), dict(zip(before.labels, before.effects, strict=True))
+    free = {(before.labels[s.effect], s.field, s.index) for s in before.slots()}
     linear = _linear(estimate, name)
-    if not linear:
+    added = [i for i in linear if (name, slots[i].field, slots[i].index) not in free]
+    added = added[max(contained - (len(linear) - len(added)), 0) :]
+    if not added:
         return True
-    sizes, covariance = np.asarray(estimate.model.vector())[linear], estimate.covariance[np.ix_(linear, linear)]
-    return bool(stats.chi2.sf(sizes @ np.linalg.pinv(covariance, hermitian=True) @ sizes, len(linear)) < NOTHING_SHOWS)
+    nothing = np.zeros(len(added))
+    for k, i in enumerate(added):
+        effect, field, index, _ = slots[i]
+        was = np.ravel(getattr(stated[name], field)) if name in stated else ()
+        # A scale factor that a simulation lacks is one; a wider form's further coefficients are none.
+        nothing[k] = was[index] if index < len(was) else float(estimate.model.effects[effect].site == "gain")
+    std = np.where(estimate.std > 0.0, estimate.std, 1.0)[added]
+    correlation = estimate.covariance[np.ix_(added, added)] / np.outer(std, std)
+    z = (np.asarray(estimate.model.vector())[added] - nothing) / std
+    return bool(stats.chi2.sf(z @ np.linalg.pinv(correlation, hermitian=True) @ z, len(added)) < NOTHING_SHOWS)
 
 
 def rests_on_one(estimate: Estimate, name: str) -> bool:
-    """Whether one sample tells nearly all of an effect that the rest of a fitted model leaves."""
+    """Whether what the rest of a fitted model leaves of an effect is, in its noise, nearly that of one wrong sample."""
     linear, record = _linear(estimate, name), estimate.record
     if not linear:
         return False
     columns = np.asarray(estimate.model.linearise(record.signals)[1])
-    white = np.asarray(whiten_columns(filter_of(record, estimate.ratios), columns))[: record.rows][record.present]
-    own, others = white[:, linear] @ np.asarray(estimate.model.vector())[linear], np.delete(white, linear, axis=1)
-    left = (own - others @ np.linalg.lstsq(others, own, rcond=1e-10)[0]) ** 2
-    return bool(left.max() > ONE_SAMPLE * left.sum())
+
+    def white(values: np.ndarray) -> np.ndarray:
+        return np.asarray(whiten_columns(filter_of(record, estimate.ratios), values))[: record.rows][record.present]
+
+    whitened = white(columns)
+    others = np.delete(whitened, linear, axis=1)
+
+    def left(values: np.ndarray) -> np.ndarray:
+        return values - others @ np.linalg.lstsq(others, values, rcond=1e-10)[0]
+
+    own = left(whitened[:, linear] @ np.asarray(estimate.model.vector())[linear])
+    largest = np.flatnonzero(record.present)[np.argmax(np.abs(own))]
+    pulse = left(white((np.arange(len(columns)) == largest)[:, None].astype(float))[:, 0])
+    return bool((own @ pulse) ** 2 > ONE_SAMPLE * (own @ own) * (pulse @ pulse))
 
 
 def _linear(estimate: Estimate, name: str) -> list[int]:

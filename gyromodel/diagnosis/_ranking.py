@@ -79,8 +79,12 @@ class Ranking:
 
     @property
     def significance(self) -> float:
-        """S of what a search would add, or of the best driver, less what that needs more (`null_scores` draws it)."""
-        tops = [top for drivers in (False, True) if (top := self.best(drivers=drivers)[0])]
+        """S of the effect that a search would add, or of the best driver, less what that needs more.
+
+        `null_scores` draws it, which does not search for noise.
+        """
+        noise = tuple(filter(is_noise, self.statistic))
+        tops = [top for drivers in (False, True) if (top := self.best(drivers=drivers, but=noise)[0])]
         return max((self.statistic[k] - self.more_needed(k) for k in tops), default=-np.inf)
 
     def more_needed(self, name: str) -> float:

@@ -131,8 +131,8 @@ class Diagnosis:
     where the model states it. `evidence` is ln B of each candidate beside what was found, and of what was found and
     what is alike as it was added, less what a random walk would take of it, for coefficients of √10, 10, √1000 and
     100 standard errors: an archive adds it up over its units. `p_value` is the chance that a campaign of this design
-    with nothing hidden shows as much evidence as this one; None if the threshold was not calibrated, or if that
-    evidence is of noise beyond what the model states.
+    with nothing hidden shows as much evidence of an effect or of a driver as this one; None if the threshold was not
+    calibrated.
     """
 
     verdict: Verdict

@@ -174,9 +174,7 @@ def _first(measured: list[Campaign], given: GyroModel, calibrate: int, seed: int
     nulls = np.zeros(0)
     if calibrate:
         nulls = null_scores(session.scanner, session.baseline, calibrate, seed, say)
-        # Draws are not searched for noise beyond what is stated: of that the safe threshold is known.
-        least = session.threshold if session.baseline.noise_given else 0.0
-        session.threshold = max(threshold_of(nulls), least)
+        session.threshold = threshold_of(nulls)
     selection = session.run(say)
     return Searched(
         data, given, model, record, readings, reading, rounding, session, selection, nulls, findings

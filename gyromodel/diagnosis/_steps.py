@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from gyromodel.diagnosis._evidence import safe_threshold
 from gyromodel.diagnosis._forms import addition, not_known
 from gyromodel.diagnosis._one_cell import CLEARLY
 from gyromodel.diagnosis._ranking import Ranking, is_noise, rank_where_it_matters
@@ -209,8 +210,9 @@ class Steps:
         return len(forms) > 1 and any(not declared.linear for declared in forms[0].declared().values())
 
     def least(self, ranking: Ranking, name: str) -> float:
-        """The evidence (ln B) that a candidate of a ranking needs."""
-        return self.threshold + ranking.more_needed(name)
+        """The evidence (ln B) that a candidate of a ranking needs; of noise, which no draw has, the safe one."""
+        safe = safe_threshold(self.baseline.degrees_of_freedom) if is_noise(name) else -np.inf
+        return max(self.threshold, safe) + ranking.more_needed(name)
 
     def further(self, found: Sequence[Found], name: str) -> float:
         """The evidence (nats) that a candidate needs besides, beside what was found."""
@@ -321,7 +323,9 @@ def _negative(estimate: Estimate, found: Sequence[Found]) -> bool:
 def _entangled(estimate: Estimate) -> bool:
     """Whether a shape is known only together with others, such as two lags that are almost the same."""
     shapes = [i for i, slot in enumerate(estimate.model.slots()) if not slot.linear]
-    correlation = estimate.covariance / np.outer(estimate.std, estimate.std)
+    # Where nothing is left there is nothing to divide by.
+    std = np.where(estimate.std > 0.0, estimate.std, 1.0)
+    correlation = estimate.covariance / np.outer(std, std)
     return bool((np.diag(np.linalg.pinv(correlation, hermitian=True))[shapes] > ENTANGLED**2).any())
 
 

@@ -119,8 +119,13 @@ def judge(
         cause = cause_of(scanner, extended, step, turn, ranking, members, statistic, trials, null_scores, least, held)
         causes.append(replace(cause, places=places(sorted(step.points), searched)) if step.points else cause)
         sets.append(members)
-    sets = _with_doubts(causes, sets, extended)
-    named_too = [c for c in causes if c.points or is_noise(c.effect) or shows(extended, c.effect)]
+    contained = {f.name: f.ranking.contained.get(f.name, 0) for f in selection.found}
+    hidden = [
+        not (c.points or is_noise(c.effect) or shows(extended, c.effect, steps.baseline.model, contained[c.effect]))
+        for c in causes
+    ]
+    sets = _with_doubts(causes, sets, extended, hidden)
+    named_too = [c for c, not_seen in zip(causes, hidden, strict=True) if not not_seen]
     # Dwells of a series that are anomalous hide nothing else.
     aside = [c.effect == "outliers" and not scanner.by_points for c in causes]
     order = sorted(range(len(causes)), key=lambda i: (aside[i], -causes[i].statistic))
@@ -231,29 +236,26 @@ def _members(
 
 
 def _with_doubts(
-    causes: Sequence[Cause], sets: Sequence[dict[str, float]], extended: Estimate
+    causes: Sequence[Cause], sets: Sequence[dict[str, float]], extended: Estimate, hidden: Sequence[bool]
 ) -> list[dict[str, float]]:
-    """Each cause's names, with those that a vague or a faint one may be another's part of."""
+    """Each cause's names, with those that a vague, a faint or a hidden one may be another's part of."""
     # Of these only something in common has a size: which of them it is, this campaign cannot tell.
     sizes = [_fitted(c) for c in causes]
     vague = [c.effect for c, s in zip(causes, sizes, strict=True) if any(p.std for p in s) and not any(map(_sized, s))]
     shared = dict.fromkeys(vague, 1.0 / len(vague)) if len(vague) > 1 else {}
     together = [s | shared if c.effect in vague else s for c, s in zip(causes, sets, strict=True)]
     return [
-        members | (_left_by(c, causes, extended, c.effect in vague) or _of_slow_noise(c, extended))
+        members | (_left_by(c, causes, extended, c.effect in vague) or (_slow_noise(extended) if not_seen else {}))
         if len(members) == 1
         else members
-        for c, members in zip(causes, together, strict=True)
+        for c, members, not_seen in zip(causes, together, hidden, strict=True)
     ]
 
 
-def _of_slow_noise(cause: Cause, estimate: Estimate) -> dict[str, float]:
+def _slow_noise(estimate: Estimate) -> dict[str, float]:
     """The slow noise that may be all of a cause which has no size beside it that shows."""
     of = {"noise_random_walk": "walk", "noise_flicker": "flicker", "noise_markov": "markov"}
-    slow = [name for name, ratio in of.items() if float(getattr(estimate.ratios, ratio)) > 0]
-    if cause.points or is_noise(cause.effect) or not slow or shows(estimate, cause.effect):
-        return {}
-    return {slow[0]: 0.5}
+    return next(({name: 0.5} for name, ratio in of.items() if float(getattr(estimate.ratios, ratio)) > 0), {})
 
 
 def _outweighed(causes: Sequence[Cause], selection: Selection, domain: str) -> bool:
