@@ -155,8 +155,8 @@ def test_an_offset_that_slow_noise_hides_is_no_firm_cause():
 
 
 @pytest.mark.law
-def test_campaigns_of_two_clocks_are_searched_for_lines_of_the_faster(rng: np.random.Generator):
-    """A line of the slower campaign and its alias: both are even times, so that no frequency is told for sure."""
+def test_a_line_of_two_regular_clocks_is_not_named_at_its_alias(rng: np.random.Generator):
+    """A line of the slower campaign: unlike steps of two campaigns are no uneven times, which would tell them apart."""
     for _ in range(3):
         logs = []
         for step, size in ((1.0, 0.0), (2.5, 1.5)):
