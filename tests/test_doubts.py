@@ -11,6 +11,7 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 
 import gyromodel as gm
+from gyromodel.diagnosis import _searches
 from gyromodel.diagnosis._apart import shows
 from gyromodel.effects.scale import ScaleFactor
 from gyromodel.report import sentence
@@ -260,3 +261,20 @@ def test_many_dwells_that_stand_apart_are_no_gross_errors(rng: np.random.Generat
     found = gm.diagnose(log, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
     assert found.verdict == "unknown"
     assert any("so many are no gross errors" in line for line in found.findings)
+
+
+def test_calibrated_thresholds_are_not_of_noise(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch):
+    """No draw is searched for noise beyond what is stated: it keeps the safe threshold."""
+    monkeypatch.setattr(_searches, "null_scores", lambda *_: np.full(400, 1.5))
+    stated = replace(
+        gm.model_from_effects(["bias"]),
+        noise={"noise_white": jnp.asarray(float(np.deg2rad(1.0 / 3600.0) * np.sqrt(STEP)))},
+    )
+    log = unit(rng, 1.0)
+    session = _searches.searched([log], stated, 400, 0, lambda line, done: None).session
+    ranking = session.steps.rank(session.baseline, [])
+    assert session.steps.least(ranking, "bias_drift") == pytest.approx(1.5)
+    assert session.steps.least(ranking, "noise_random_walk") > 3.0
+    found = gm.diagnose(log, stated, hold_out=False, calibrate=400)
+    assert found.threshold_kind == "calibrated"
+    assert found.p_value in (1.0 / 401.0, 1.0)
