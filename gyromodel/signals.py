@@ -85,10 +85,13 @@ class Record(NamedTuple):
 
     @property
     def imprecision(self) -> float:
-        """The variance that double precision leaves of a sample: its rounding, and that of what it is compared with."""
+        """The variance that double precision leaves of a sample: its rounding, and that of what it is compared with.
+
+        Never 0, as the outputs themselves may be: what a fit leaves is divided by it.
+        """
         sizes = np.sort(np.abs(np.asarray(self.signals["output"])[: self.rows][self.present]))
         size = float(sizes[int(USUAL * (len(sizes) - 1))]) if len(sizes) else 0.0
-        return (ROUNDED * np.finfo(float).eps * size) ** 2
+        return max((ROUNDED * np.finfo(float).eps * size) ** 2, float(np.finfo(float).tiny))
 
     @property
     def run(self) -> np.ndarray:

@@ -173,3 +173,9 @@ def test_the_true_gain_of_the_study_is_that_of_least_squares_on_average(effect: 
 def test_rounds_are_cut_where_the_error_left_out_rises_for_good(after: list[tuple[float, float]], cut: bool) -> None:
     """Held-out errors and log scores of rounds after one with 1 and 100."""
     assert _session.rises_for_good((1.0, 100.0), *after) == cut
+
+
+def test_the_errors_of_one_block_give_no_ratio():
+    """Two thirds of the record are the model's to the last digit: without the third block there is 0 over 0."""
+    gain = _summary(np.array([0.0, 0.0, 4.0]), np.array([0.0, 0.0, 1.0]), np.ones(3), np.full(3, 50.0), "thirds", "", 1)
+    assert gain.ratio == pytest.approx(2.0) and gain.ci95 == (0.0, np.inf)

@@ -252,7 +252,8 @@ def test_stated_noise_is_that_before_rounding():
 
 
 @pytest.mark.long
-def test_two_levels_do_not_end_a_search():
+@pytest.mark.parametrize("hold_out", [False, True])
+def test_two_levels_do_not_end_a_search(hold_out: bool):
     """A gyro that hardly leaves a step: every value but a few is the same, and a fit may leave nothing at all."""
     rng = np.random.default_rng(4)
     time = np.arange(600.0)
@@ -260,7 +261,7 @@ def test_two_levels_do_not_end_a_search():
     output[rng.permutation(600)[:9]] = -0.02
     columns = {"time": time, "temperature": 20.0 + 10.0 * np.sin(time / 90.0), "output": output}
     campaign = gm.Campaign(columns, {"time": "s", "temperature": "degC", "output": "deg/s"}, {"kind": "rate"})
-    found = gm.diagnose(campaign, gm.model_from_effects(["bias"]), hold_out=False)
+    found = gm.diagnose(campaign, gm.model_from_effects(["bias"]), hold_out=hold_out)
     assert "quantisation" in {c.effect for c in found.causes}
     assert found.verdict in ("named", "ambiguous")
 

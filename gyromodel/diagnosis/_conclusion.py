@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gyromodel.diagnosis._evidence import safe_threshold
 from gyromodel.diagnosis._extended import finished, louder, stated_counts, stated_hops, stated_level
 from gyromodel.diagnosis._isolation import settling_test
 from gyromodel.diagnosis._judgement import Judgement, structured, undecided, with_noise, with_steps
@@ -119,7 +120,8 @@ def _counts(found: Searched) -> Estimate | None:
     if not found.of_gyro or found.rounding.saw_tooth:
         return None
     free = None if selection.unfinished else with_noise_estimated(last)
-    stepped = quantisation(free, found.session.threshold, last if last.noise_given else None) if free else None
+    least = max(found.session.threshold, safe_threshold(last.degrees_of_freedom))
+    stepped = quantisation(free, least, last if last.noise_given else None) if free else None
     band = None if selection.unresolved else excess_band(free or last)
     if band:
         found.findings.append(band.told(found.session.record))

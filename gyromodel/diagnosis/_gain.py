@@ -197,8 +197,11 @@ def _summary(
     # Jackknife over blocks for the ratio, Student's t over blocks for the log score; few blocks may be alike by chance,
     # so neither is taken to be known better than white noise of that many errors leaves it.
     totals = np.stack([before, after]) * sizes
-    logs = 0.5 * np.log(np.divide(*(totals.sum(axis=1, keepdims=True) - totals)))
-    spread = np.sqrt((folds - 1) / folds * np.sum((logs - logs.mean()) ** 2))
+    others = totals.sum(axis=1, keepdims=True) - totals
+    spread = np.inf  # Where one block holds all errors there are, as of outputs that hardly leave a step.
+    if np.all(others > 0.0):
+        logs = 0.5 * np.log(np.divide(*others))
+        spread = np.sqrt((folds - 1) / folds * np.sum((logs - logs.mean()) ** 2))
     t, z = float(stats.t.ppf(0.975, folds - 1)), float(stats.norm.ppf(0.975))
     total, error = float(scores.sum()), float(np.sqrt(folds) * scores.std(ddof=1))
     beside = max(t * error, z * np.sqrt(2.0 * abs(total)))

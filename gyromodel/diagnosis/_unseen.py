@@ -100,5 +100,5 @@ def _shows(estimate: Estimate, label: str) -> bool:
         signals = record.signals
         added = np.where(record.sampling.present, model.predict(signals) - model.without(label).predict(signals), 0.0)
         white = np.asarray(whiten_columns(filter_of(record, estimate.ratios), pad_columns(added[:, None])))[:, 0]
-        energy = float(white @ white) / max(estimate.white_variance, np.finfo(float).tiny)
+        energy = float(white @ white) / estimate.white_variance
     return bool(chi2.sf(energy, max(len(own), 1)) < UNSEEN)

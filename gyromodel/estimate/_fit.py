@@ -308,8 +308,7 @@ def _finish(
     noise = dict(model.noise) or noise_coefficients(ratios, white, record, float(model.gain()))
     rows = record.rows
     whitened = np.full(rows, np.nan)
-    # The square of what is left may be below all numbers.
-    whitened[record.present] = w[:, p] / np.sqrt(max(white, np.finfo(float).tiny))
+    whitened[record.present] = w[:, p] / np.sqrt(white)
     return Estimate(
         model=replace(model, noise=noise, noise_of=record.domain),
         covariance=covariance * white,
