@@ -177,5 +177,7 @@ def test_rounds_are_cut_where_the_error_left_out_rises_for_good(after: list[tupl
 
 def test_the_errors_of_one_block_give_no_ratio():
     """Two thirds of the record are the model's to the last digit: without the third block there is 0 over 0."""
-    gain = _summary(np.array([0.0, 0.0, 4.0]), np.array([0.0, 0.0, 1.0]), np.ones(3), np.full(3, 50.0), "thirds", "", 1)
-    assert gain.ratio == pytest.approx(2.0) and gain.ci95 == (0.0, np.inf)
+    before, after = np.array([0.0, 0.0, 4.0]), np.array([0.0, 0.0, 1.0])
+    gain = _summary(before, after, np.ones(3), np.full(3, 50.0), "thirds", "deg/h", 1.0)
+    assert gain.ratio == pytest.approx(2.0)
+    assert gain.ci95 == (0.0, np.inf)
