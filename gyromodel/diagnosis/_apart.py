@@ -104,14 +104,15 @@ def shows(estimate: Estimate, name: str, before: GyroModel, contained: int = 0) 
         estimate: the fit of the extended model.
         name: the effect.
         before: the simulation.
-        contained: how many of the effect's coefficients the simulation has, under this or another name.
+        contained: how many of the effect's coefficients are free in the simulation, under this or another name; taken
+            to be its first, as the terms of a curve are.
     """
     slots, stated = estimate.model.slots(), dict(zip(before.labels, before.effects, strict=True))
     free = {(before.labels[s.effect], s.field, s.index) for s in before.slots()}
     linear = _linear(estimate, name)
     added = [i for i in linear if (name, slots[i].field, slots[i].index) not in free]
     added = added[max(contained - (len(linear) - len(added)), 0) :]
-    if not added:
+    if not (len(added) and estimate.std[added].any()):
         return True
     nothing = np.zeros(len(added))
     for k, i in enumerate(added):

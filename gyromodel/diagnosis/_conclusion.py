@@ -92,6 +92,9 @@ def conclude(found: Searched, hold_out: bool) -> Conclusion:
         extended = stated_counts(extended, counts)
     elif times := noise_level(last):
         extended = louder(extended, times)
+        found.findings.append(
+            f"The noise is {times:.3g} times as large as the model states: the extended model states that."
+        )
     extended = _with_noise_stated(found, extended)
     return Conclusion(_in_doubt(found, judgement, baseline, extended), baseline, extended, coarse, ordinary)
 
@@ -104,8 +107,6 @@ def _remarks(found: Searched) -> None:
     # What rounding leaves is larger at edges of steps, where there is much more to tell than tails.
     left = () if found.rounding.saw_tooth else (tails(last), dwells_apart(last, found.data.unit))
     findings += [line for line in left if line]
-    if times := noise_level(last):
-        findings.append(f"The noise is {times:.3g} times as large as the model states: the extended model states that.")
     stated, slope = float(found.model.gain()), float(last.model.gain())
     if slope * (stated if np.isfinite(stated) else 1.0) < 0:
         findings.append(

@@ -148,14 +148,21 @@ def _highest(interval: float, span: float) -> float:
 
 
 def _uneven(record: Record) -> bool:
-    """Whether samples of one run stand so unevenly that a line and its alias at the mean sample rate look different.
+    """Whether samples of each run stand so unevenly that a line and its alias at the mean sample rate look different.
 
-    Most steps are then no multiples of the usual one, which several clocks, or bursts of one, are.
+    Most steps are then no multiples of the run's usual one, which bursts of a clock are.
     """
-    step = np.asarray(record.sampling.interval)[1 : record.rows] / record.interval
-    low, high = np.quantile(step, [0.1, 0.9]) if len(step) else (0.0, 0.0)
-    off = np.median(np.abs(step - np.round(step))) if len(step) else 0.0
-    return bool(record.run[-1] == 0 and high - low > UNEVEN and off > 0.1)
+    run, interval = record.run[: record.rows], np.asarray(record.sampling.interval)[: record.rows]
+    within = np.flatnonzero(run[1:] == run[:-1]) + 1
+    return bool(len(within)) and all(
+        _no_multiples(interval[within[run[within] == number]]) for number in np.unique(run[within])
+    )
+
+
+def _no_multiples(step: np.ndarray) -> bool:
+    step = step / np.median(step)
+    low, high = np.quantile(step, [0.1, 0.9])
+    return bool(high - low > UNEVEN and np.median(np.abs(step - np.round(step))) > 0.1)
 
 
 def line_grid(record: Record) -> LineGrid | None:

@@ -119,9 +119,9 @@ def judge(
         cause = cause_of(scanner, extended, step, turn, ranking, members, statistic, trials, null_scores, least, held)
         causes.append(replace(cause, places=places(sorted(step.points), searched)) if step.points else cause)
         sets.append(members)
-    contained = {f.name: f.ranking.contained.get(f.name, 0) for f in selection.found}
+    simulated, contained = steps.baseline.model, selection.first.contained
     hidden = [
-        not (c.points or is_noise(c.effect) or shows(extended, c.effect, steps.baseline.model, contained[c.effect]))
+        not (c.points or is_noise(c.effect) or shows(extended, c.effect, simulated, contained.get(c.effect, 0)))
         for c in causes
     ]
     sets = _with_doubts(causes, sets, extended, hidden)

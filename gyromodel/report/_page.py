@@ -163,7 +163,9 @@ def _tiles(diagnosis: Diagnosis) -> list[dict[str, str]]:
     # Gross errors that were given up say nothing of the simulation.
     aside = diagnosis.verdict == "adequate" and gave_up(diagnosis)
     best = max((r.statistic for r in diagnosis.rounds if r.added and not aside), default=None)
-    top = [c.statistic for r in diagnosis.rounds[-1 if aside else 0 :][:1] for c in r.ranking]
+    # Noise needs more than a calibrated bound, which is of effects.
+    ranked = [c for r in diagnosis.rounds[-1 if aside else 0 :][:1] for c in r.ranking]
+    top = [c.statistic for c in ranked if c.kind != "noise" or diagnosis.threshold_kind == "safe"]
     if best is None and top:
         best = max(top)
     if best is not None:

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 _RANKED = 12
 # Standard deviations from a size to an end of its interval from which on the interval is told beside the size.
 _HELPED = 2.1
+# Evidence that noise needs, whatever was calibrated: the safe threshold.
+_NOISE_NEEDS = 3.0
 
 
 def cause_row(cause: Cause, at: Held) -> dict[str, Any]:
@@ -70,7 +72,7 @@ def rankings(diagnosis: Diagnosis) -> list[dict[str, Any]]:
                 "kind": c.kind,
                 "statistic": evidence(c.statistic),
                 "bar": _bar(c.statistic, top),
-                "above": c.statistic > diagnosis.threshold,
+                "above": c.statistic > max(diagnosis.threshold, _NOISE_NEEDS * (c.kind == "noise")),
                 "posterior": percent(c.posterior),
                 "chosen": c.effect == chosen,
             }
@@ -231,11 +233,13 @@ def threshold(diagnosis: Diagnosis) -> str:
     bound = number(diagnosis.threshold, 2)
     if diagnosis.threshold_kind == "calibrated":
         p = diagnosis.p_value
-        share = "" if p is None else f"As much evidence as here is reached in {100 * p:.2g} % of them."
+        share = "" if p is None else f" As much evidence of an effect as here is reached in {100 * p:.2g} % of them."
+        if diagnosis.baseline.noise_given:
+            share += f" Noise beyond what the simulation states needs {number(_NOISE_NEEDS)} or more."
         return (
             f"An effect is accepted when its evidence exceeds {bound}. This bound was calibrated: the best of all "
             "candidates exceeds it in one of 100 simulations or fewer of this campaign with its noise and nothing "
-            f"missing. {share}"
+            f"missing.{share}"
         )
     return (
         f"An effect is accepted when its evidence exceeds {bound}, odds of {_odds(diagnosis.threshold)} after paying "
