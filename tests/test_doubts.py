@@ -51,7 +51,7 @@ def test_a_doubt_beside_a_firm_cause_stays_one_of_the_verdict(rng: np.random.Gen
             continue
         told = {row["id"]: row["found"] for row in searched_rows(found)}
         assert [told.get(name, "") for name in found.credible_set] == ["possible"] * len(found.credible_set)
-        assert "second thermometer at the coil" in (found.next_test or "")
+        assert "one more thermometer, at the coil" in (found.next_test or "")
         assert "lacks a bias proportional to supply voltage of (1." in sentence(found)
     assert binom.cdf(right, 8, 0.97) > 1e-3
 

@@ -14,9 +14,9 @@ from gyromodel.units import factor
 # What parts two effects that no other course of the same columns does, or not as directly as this.
 BETWEEN_PAIRS = {
     frozenset({"temperature_lag", "bias_temperature_rate"}): (
-        "Log one more thermometer, at the coil itself: the bias is a plain function of its reading if the first one is late, "
-        "and keeps a part that follows the temperature's rate if not. Or ramp through temperatures where the bias "
-        "rises and where it falls: what a late thermometer makes changes sign between them."
+        "Log one more thermometer, at the coil itself: the bias is a plain function of its reading if the first one is "
+        "late, and keeps a part that follows the temperature's rate if not. Or ramp through temperatures where the "
+        "bias rises and where it falls: what a late thermometer makes changes sign between them."
     ),
     frozenset({"time_delay", "bandwidth"}): (
         "Drive the rate at higher frequencies than here: a lag attenuates there and its phase levels off, while the "
