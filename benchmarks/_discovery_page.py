@@ -15,7 +15,7 @@ from benchmarks._discovery_figures import draw_confusion, draw_power
 from benchmarks._kept import Kept, code
 from tests.truth import levels, study
 from tests.truth.campaigns import HOMES, MOTION, TESTABLE
-from tests.truth.laws import Told
+from tests.truth.laws import NEEDED, Told
 from tests.truth.noise import FAMILY
 from tests.truth.other_designs import OTHER_DESIGNS
 from tests.truth.verdicts import Score, allowed
@@ -46,7 +46,8 @@ def write_page(output: Path, whole: list[Kept]) -> None:
     reached += levels.outside_levels(parts["effects 3, outside"])
     reached += levels.unknown_levels(uncatalogued) + levels.pair_levels(parts["pairs"] + parts["pairs, moving"])
     reached += levels.amplitude_levels(main_sizes) + levels.ambiguity_levels(parts["inseparable"], parts["drifts"])
-    reached += levels.other_levels(parts["effects 3, other"] + parts["effects 10, other"])
+    few_log = parts["effects 3, other"] + parts["effects 10, other"]
+    reached += levels.other_levels(few_log)
     reached += levels.superfluous_levels(parts["nothing, superfluous"], parts["effects 10, superfluous"])
     reached += [levels.settled_level(parts["inseparable"]), levels.noise_level(nulls)]
     reached += [levels.adequacy_level(sized[3.0]), levels.claim_level(parts["forced"])]
@@ -67,6 +68,7 @@ def write_page(output: Path, whole: list[Kept]) -> None:
         _spent(whole[-1].seconds, whole[-1].timed),
         *(_leak(sized[s], s) for s in (1.0, 3.0)),
         *_beside_names(sized[1.0]),
+        *_wrong_too({"catalogue": sized[3.0] + sized[10.0], "of what few campaigns log": few_log}),
         *_bounds(parts, told),
         *control_checks,
         *mutant_checks,
@@ -298,6 +300,17 @@ def _beside_names(records: list[study.Record]) -> list[str]:
     return [f"| 5 | {k} | – | – | {100 * n / max(m, 1):.1f} % | {m} | – | |" for k, (n, m) in counted.items()]
 
 
+def _wrong_too(groups: dict[str, list[study.Record]]) -> list[str]:
+    """Row 6 of an oracle that knows noise and size: where it is as sure of what is firm and wrong here."""
+    rows = []
+    for measure, records in groups.items():
+        wrong = [r for r in records if r.score and r.score.firm_and_wrong and r.answer]
+        too = sum(r.oracle_firm and r.oracle_first in r.answer.causes for r in wrong if r.answer)
+        shown = f"what bounds it: of what is firm and wrong here, 3× and 10×, {measure}, named by the oracle as firmly"
+        rows += [f"| 6 | {shown} | – | – | {100 * too / len(wrong):.1f} % | {len(wrong)} | – | |"] if wrong else []
+    return rows
+
+
 def asked(label: str, records: list[study.Record]) -> list[study.Record]:
     """The campaigns of a part that the oracle is asked about: of effects those that the engine has not told right.
 
@@ -326,6 +339,8 @@ def _bounds(parts: dict[str, list[study.Record]], told: dict[str, list[Told]]) -
     for noise in FAMILY:
         said = [bool(t.said) for r, t in nulls if r.case.noise == noise]
         counted["2", f"something said, {noise.replace('_', ' ')}"] = said
+    needless = [bool(t.said) for _, t in both.get("nothing, superfluous", [])]
+    counted["1", "something said, one to four effects simulated that are not there"] = needless
     if "unknown 10" in both:
         missed = both["unknown 10"] + both.get("unknown 10, moving", [])
         counted["8", "flagged of those not flagged here, 10×, told the column but not its function"] = _ahead(missed)
@@ -333,8 +348,9 @@ def _bounds(parts: dict[str, list[study.Record]], told: dict[str, list[Told]]) -
     mistaken = [(r, t) for r, t in asked_all if r.score and r.score.called_unknown]
     counted["9", "flagged of those called unknown here, 1×, told the column that was named"] = _ahead(mistaken)
     not_named = both.get("effects 10", []) + both.get("effects 10, white", [])
-    more = [bool(t.said) for _, t in not_named]
-    counted["5", "something said besides of those not named here, 10×, told the hidden effect but not its size"] = more
+    besides = "something said besides of those not named here, 10×, told the hidden effect but not its size"
+    counted["5", besides] = [bool(t.said) for _, t in not_named]
+    counted["5", f"{besides}, of what few campaigns log"] = [bool(t.said) for _, t in both.get("effects 10, other", [])]
     shown = [(r, t) for r, t in asked_all if _shown(r)]
     here = 100 * np.mean([bool(r.score and r.score.named) for r, _ in shown]) if shown else 0.0
     named = [levels.told_right(r, t.said) for r, t in shown]
@@ -355,9 +371,9 @@ def _bounds(parts: dict[str, list[study.Record]], told: dict[str, list[Told]]) -
 
 
 def _ahead(both: list[tuple[study.Record, Told]]) -> list[bool]:
-    """Where an oracle has a function of the column ahead of every name, of campaigns where it knows the column."""
+    """Where an oracle tells of a function of the column ahead of every name, of campaigns where it knows the column."""
     known = [t.evidence for _, t in both if "smooth" in t.evidence]
-    return [evidence["smooth"] == max(evidence.values()) for evidence in known]
+    return [evidence["smooth"] == max(evidence.values()) >= NEEDED for evidence in known]
 
 
 def _mutants(parts: dict[str, list[study.Record]]) -> tuple[list[str], list[str]]:
