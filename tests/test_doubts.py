@@ -122,6 +122,7 @@ def unit(rng: np.random.Generator, level: float, error: np.ndarray | float = 0.0
     return gm.Campaign(values, units, {"kind": "rate"})
 
 
+@pytest.mark.long
 @pytest.mark.law
 @pytest.mark.parametrize("louder", [1.0, 4.0])
 def test_campaigns_of_unlike_noise_hide_nothing(louder: float, rng: np.random.Generator):
@@ -155,6 +156,7 @@ def test_an_offset_that_slow_noise_hides_is_no_firm_cause():
         assert found.verdict in ("ambiguous", "unknown")
 
 
+@pytest.mark.long
 @pytest.mark.law
 def test_a_line_of_two_regular_clocks_is_not_named_at_its_alias(rng: np.random.Generator):
     """A line of the slower campaign: unlike steps of two campaigns are no uneven times, which would tell them apart."""
@@ -173,6 +175,7 @@ def test_a_line_of_two_regular_clocks_is_not_named_at_its_alias(rng: np.random.G
     assert binom.cdf(right, 4, 0.95) > 1e-3
 
 
+@pytest.mark.long
 def test_lines_of_two_campaigns_of_uneven_times_are_searched_as_far_as_of_one(rng: np.random.Generator):
     """Above half of their mean rate, which even times would have folded: 0.021 Hz at 0.025 Hz."""
     logs = []
@@ -220,6 +223,7 @@ def test_what_one_sample_tells_may_be_a_gross_error(rng: np.random.Generator):
     assert {"outliers", "bias_supply_voltage"} <= set(found.credible_set)
 
 
+@pytest.mark.long
 @pytest.mark.law
 def test_a_column_that_steps_in_a_random_walk_is_no_gross_error(rng: np.random.Generator):
     """In a walk a step tells by the one increment at its edge, which no single wrong sample makes."""
