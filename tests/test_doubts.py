@@ -276,7 +276,9 @@ def test_many_dwells_that_stand_apart_are_no_gross_errors(rng: np.random.Generat
     )
     found = gm.diagnose(log, gm.model_from_effects(["scale_factor", "bias"]), hold_out=False)
     assert found.verdict == "unknown"
-    assert any("so many are no gross errors" in line for line in found.findings)
+    # Where steps are found among them first, dwells are left that the search could not add.
+    told = ("so many are no gross errors", "More remains than was named")
+    assert any(words in line for line in found.findings for words in told)
 
 
 def test_calibrated_thresholds_are_not_of_noise(monkeypatch: pytest.MonkeyPatch):
