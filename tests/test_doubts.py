@@ -143,7 +143,8 @@ def test_what_all_campaigns_lack_is_weighted_by_their_noise(rng: np.random.Gener
     [size] = found.causes[0].parameters
     assert found.causes[0].effect == "bias_temperature"
     alone = 1.0 / np.linalg.norm(temperature - temperature.mean())
-    assert size.std == pytest.approx(alone, rel=0.15)
+    # Estimated slow noise adds some tenths; in one noise for both it is four times as large.
+    assert 0.85 * alone < size.std < 1.7 * alone
     assert abs(size.value - 0.05) < 4.0 * size.std
 
 
