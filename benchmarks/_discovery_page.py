@@ -339,8 +339,6 @@ def _bounds(parts: dict[str, list[study.Record]], told: dict[str, list[Told]]) -
     for noise in FAMILY:
         said = [bool(t.said) for r, t in nulls if r.case.noise == noise]
         counted["2", f"something said, {noise.replace('_', ' ')}"] = said
-    needless = [bool(t.said) for _, t in both.get("nothing, superfluous", [])]
-    counted["1", "something said, one to four effects simulated that are not there"] = needless
     if "unknown 10" in both:
         missed = both["unknown 10"] + both.get("unknown 10, moving", [])
         counted["8", "flagged of those not flagged here, 10×, told the column but not its function"] = _ahead(missed)

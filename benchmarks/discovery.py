@@ -46,7 +46,7 @@ FEWEST = 24
 # Parts that an oracle is asked about which knows how levels of noise are drawn.
 ORACLE = (
     "nothing", "effects 1", "effects 1, white", "effects 10", "effects 10, white", "unknown 10", "unknown 10, moving",
-    "inseparable", "nothing, moving", "nothing, superfluous", "effects 10, other",
+    "inseparable", "nothing, moving", "effects 10, other",
 )  # fmt: skip
 DRAWS = 200  # of a calibration whose p-values are looked at
 # Diagnoses timed: campaigns of about 1000 rows.

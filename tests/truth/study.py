@@ -167,19 +167,15 @@ def oracle_told(record: Record, *, beside: bool = False) -> Told:
     design, truth = built.design, built.truth
     data = np.deg2rad(built.columns["output"]) - design.true["rate"]
     none = np.zeros((len(data), 0))
+    fixed = np.column_stack([none, *(error(name, design, 1.0, {}) for name in truth.baseline)])
     signals = contest.everything(design, record.case.effect)
-    superfluous = [signals.pop(name).reshape(len(data), -1) for name in record.case.superfluous if name in signals]
-    simulated = [error(name, design, 1.0, {}) for name in truth.baseline]
-    # Of a superfluous effect every shape is fitted, which forms between two span together.
-    basis, size, _ = np.linalg.svd(np.column_stack([none, *superfluous]), full_matrices=False)
-    fixed = np.column_stack([none, *simulated, basis[:, size > 1e-6 * size.max(initial=0.0)]])
     if beside:
         fixed = np.column_stack([fixed, truth.error / np.abs(truth.error).max()])
         signals = {name: block for name, block in signals.items() if name not in parts(truth.effect)}
     driver = truth.driver or (record.answer.driver if record.answer and known(truth.effect) else ())
     smooths = contest.smooths(design, driver) if driver else {}
     told = tell(data, design, fixed, signals | smooths)
-    if truth.effect is None and not superfluous and record.case.seed % SOME == 0:
+    if truth.effect is None and record.case.seed % SOME == 0:
         told = told._replace(anyhow=kinds_of_any_level(data, design, fixed))
     if not smooths:
         return told
