@@ -6,9 +6,11 @@ This file must not import gyromodel: the run-time shape checks are installed aft
 from __future__ import annotations
 
 import os
+import re
 import secrets
 import signal
 from collections.abc import Callable
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -21,13 +23,6 @@ import tests.typechecker  # noqa: F401  the import hook of pyproject.toml looks 
 
 ROOT = Path(__file__).resolve().parents[1]
 CACHE = ROOT / ".cache"
-# Whose tests hold what a search tells of one campaign, or of a few: not of each draw.
-VERDICTS = {f"test_{name}" for name in (
-    "archive_effects", "diagnosis", "doubts", "held_out", "honesty", "isolation", "memory_effects", "misfit",
-    "monitors", "motion_effects", "noise_causes", "noise_identification", "platform_diagnosis", "poses", "report",
-    "ring_laser", "rounded_sweeps", "temperature_curves", "thermometer_noise", "three_axes", "twins", "unlisted",
-)}  # fmt: skip
-
 # Whose verdicts are of one draw, the same in each run: they err as often as the threshold allows, which
 # test_discovery.py measures.
 FIXED = {"test_as_recorded", "test_diagnosis", "test_held_out", "test_honesty"}
@@ -67,12 +62,18 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """
     for item in items:
         drawn = isinstance(item, pytest.Function) and "seed" in item.fixturenames
-        if drawn and Path(item.path).stem in VERDICTS and not item.get_closest_marker("law"):
+        if drawn and _of_diagnosis(item.path) and not item.get_closest_marker("law"):
             item.add_marker(pytest.mark.flaky(reruns=1))
     first = [item for item in items if "test_discovery" in item.nodeid and item.get_closest_marker("long")]
     rest = [item for item in items if item not in first]
     half = len(items) // 2 - len(first[::2])
     items[:] = [*first[::2], *rest[:half], *first[1::2], *rest[half:]]
+
+
+@cache
+def _of_diagnosis(file: Path) -> bool:
+    """Whether tests hold what a search tells of one campaign, or of a few: not of each draw."""
+    return re.search("diagnos|verdict", file.read_text(encoding="utf-8")) is not None
 
 
 @pytest.hookimpl(wrapper=True)

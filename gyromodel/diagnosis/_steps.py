@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -130,25 +131,23 @@ class Steps:
 
     def _fitted(self, data: Record, model: GyroModel, found: Sequence[Found], how: dict[str, Any]) -> Estimate | None:
         """See `fit`."""
-        entangled, lost, searched = None, 0, _shapes_held(model, found)
+        searched = _shapes_held(model, found)
         attempts = (model,) if searched.fixed == model.fixed else (model, searched)
-        for attempt in attempts:
-            try:
-                after = fit_record(data, attempt, **how)
-            except EstimateError:
-                lost += 1
-                continue
-            if _negative(after, found):
-                continue
-            if not _entangled(after):
-                return after
-            entangled = after
-        if lost < len(attempts):
-            return entangled
         # What was found may have taken the place of an effect of the simulation.
         simulated = set(self.baseline.model.labels) & set(model.labels) - {f.effect.label for f in found if f.effect}
-        after = beside_unseen(data, searched, simulated, **how)
-        return None if after is None or _negative(after, found) else after
+        for fitted in (_fit, partial(beside_unseen, labels=simulated)):
+            entangled, lost = None, 0
+            for attempt in attempts:
+                after = fitted(data, attempt, **how)
+                if after is None:
+                    lost += 1
+                elif not _negative(after, found):
+                    if not _entangled(after):
+                        return after
+                    entangled = after
+            if lost < len(attempts):
+                return entangled
+        return None
 
     def rank_beside(self, estimate: Estimate, found: Sequence[Found], columns: np.ndarray) -> Ranking:
         """All candidates beside a fit with what was found and beside further columns, which explain what they can."""
@@ -272,6 +271,13 @@ class Steps:
         others = [*found[:i], *found[i + 1 :]]
         estimate = self.fit(others)
         return None if estimate is None else (estimate, self.rank(estimate, others))
+
+
+def _fit(data: Record, model: GyroModel, **how: Any) -> Estimate | None:
+    try:
+        return fit_record(data, model, **how)
+    except EstimateError:
+        return None
 
 
 def standing(path: Sequence[Found]) -> list[Found]:

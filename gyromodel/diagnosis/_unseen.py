@@ -42,10 +42,11 @@ def fitted(record: Record, model: GyroModel, start: NoiseRatios | None = None) -
 
 
 def beside_unseen(record: Record, model: GyroModel, labels: Collection[str], **how: Any) -> Estimate | None:
-    """The fit with the shapes held of those among some effects that do not show; None where none helps."""
+    """The fit with the shapes held of those among some effects that do not show, or not in what shape; else None."""
     try:
         held = fit_record(record, model.with_shapes_held(labels), **how)
-        fewer = model.with_shapes_held([label for label in labels if not _shows(held, label)])
+        shown = {label for label in labels if _shows(held, label) and _in_shape(held, model, label)}
+        fewer = model.with_shapes_held([label for label in labels if label not in shown])
         return fit_record(record, fewer, **how) if fewer.fixed != model.fixed else None
     except EstimateError:
         return None
@@ -98,7 +99,22 @@ def _shows(estimate: Estimate, label: str) -> bool:
         energy = float(values @ np.linalg.solve(estimate.covariance[np.ix_(own, own)], values))
     else:
         signals = record.signals
-        added = np.where(record.sampling.present, model.predict(signals) - model.without(label).predict(signals), 0.0)
-        white = np.asarray(whiten_columns(filter_of(record, estimate.ratios), pad_columns(added[:, None])))[:, 0]
-        energy = float(white @ white) / estimate.white_variance
+        energy = _energy(estimate, np.asarray(model.predict(signals) - model.without(label).predict(signals)))
     return bool(chi2.sf(energy, max(len(own), 1)) < UNSEEN)
+
+
+def _in_shape(estimate: Estimate, model: GyroModel, label: str) -> bool:
+    """Whether each shape of an effect that a model leaves free would show if it changed by as much as it is."""
+    fitted = estimate.model
+    freed = replace(fitted, fixed=fitted.fixed - {key for key in fitted.fixed - model.fixed if key[0] == label})
+    own = [i for i, s in enumerate(freed.slots()) if not s.linear and freed.labels[s.effect] == label]
+    changes = np.asarray(freed.linearise(estimate.record.signals)[1])[:, own] * np.asarray(freed.vector())[own]
+    return all(chi2.sf(_energy(estimate, change), 1) < UNSEEN for change in changes.T)
+
+
+def _energy(estimate: Estimate, signal: np.ndarray) -> float:
+    """What a signal has beside the noise of a fit (σ²)."""
+    record = estimate.record
+    present = np.where(record.sampling.present, signal, 0.0)
+    white = np.asarray(whiten_columns(filter_of(record, estimate.ratios), pad_columns(present[:, None])))[:, 0]
+    return float(white @ white) / estimate.white_variance
