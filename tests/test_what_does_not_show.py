@@ -166,3 +166,20 @@ def test_what_one_block_alone_tells_is_not_predicted_without_it(seed: int):
     assert any("bias_warmup (time_constant)" in line for line in found.findings) == (seed == 6)
     assert "1 more could not be predicted" in found.gain.scheme
     assert 0.25 < found.gain.after < found.gain.before < 0.45
+
+
+def test_a_warm_up_of_which_a_short_record_shows_the_bend_alone(rng: np.random.Generator):
+    """In 10 s, beside a drift, any time constant far above that makes the same: the diagnosis ended with that."""
+    time = 0.01 * np.arange(1000)
+    rate = 50.0 * np.sin(2.0 * np.pi * 0.7 * time)
+    output = rate + 0.1 * time - 0.015 * time**2 + 0.05 * rng.standard_normal(len(time))
+    log = gm.Campaign(
+        {"time": time, "rate": rate, "output": output},
+        {"time": "s", "rate": "deg/s", "output": "deg/s"},
+        {"kind": "rate"},
+    )
+    effects = ["bias", "scale_factor", "bias_warmup", "bias_drift"]
+    found = gm.diagnose(log, gm.model_from_effects(effects), hold_out=False)
+    assert found.verdict == "adequate"
+    assert any("bias_warmup (time_constant)" in line for line in found.findings)
+    assert found.residual_after.std() < 0.055

@@ -91,30 +91,37 @@ def _determined(record: Record, model: GyroModel) -> GyroModel:
 
 def _shows(estimate: Estimate, label: str) -> bool:
     """Whether an effect's free sizes differ from nothing; of one without, whether what it adds does."""
-    model, record = estimate.model, estimate.record
+    model, signals = estimate.model, estimate.record.signals
     of = model.labels.index(label)
     own = [i for i, slot in enumerate(model.slots()) if slot.linear and slot.effect == of]
     if own:
         values = np.asarray(model.vector())[own]
         energy = float(values @ np.linalg.solve(estimate.covariance[np.ix_(own, own)], values))
     else:
-        signals = record.signals
-        energy = _energy(estimate, np.asarray(model.predict(signals) - model.without(label).predict(signals)))
+        added = np.asarray(model.predict(signals) - model.without(label).predict(signals))
+        energy = float(np.sum(_whitened(estimate, added[:, None]) ** 2)) / estimate.white_variance
     return bool(chi2.sf(energy, max(len(own), 1)) < UNSEEN)
 
 
 def _in_shape(estimate: Estimate, model: GyroModel, label: str) -> bool:
-    """Whether each shape of an effect that a model leaves free would show if it changed by as much as it is."""
+    """Whether each shape that a model leaves free of an effect would show beside all else if it changed by itself."""
     fitted = estimate.model
     freed = replace(fitted, fixed=fitted.fixed - {key for key in fitted.fixed - model.fixed if key[0] == label})
     own = [i for i, s in enumerate(freed.slots()) if not s.linear and freed.labels[s.effect] == label]
-    changes = np.asarray(freed.linearise(estimate.record.signals)[1])[:, own] * np.asarray(freed.vector())[own]
-    return all(chi2.sf(_energy(estimate, change), 1) < UNSEEN for change in changes.T)
+    columns = _whitened(estimate, np.asarray(freed.linearise(estimate.record.signals)[1]))
+    length = np.linalg.norm(columns, axis=0)
+    columns = columns / np.where(length > 0.0, length, 1.0)
+    for i in own:
+        others = np.delete(columns, i, axis=1)
+        left = columns[:, i] - others @ np.linalg.lstsq(others, columns[:, i])[0]
+        change = float(left @ left) * (length[i] * float(freed.vector()[i])) ** 2 / estimate.white_variance
+        if not chi2.sf(change, 1) < UNSEEN:
+            return False
+    return True
 
 
-def _energy(estimate: Estimate, signal: np.ndarray) -> float:
-    """What a signal has beside the noise of a fit (σ²)."""
+def _whitened(estimate: Estimate, columns: np.ndarray) -> np.ndarray:
+    """Columns beside the noise of a fit."""
     record = estimate.record
-    present = np.where(record.sampling.present, signal, 0.0)
-    white = np.asarray(whiten_columns(filter_of(record, estimate.ratios), pad_columns(present[:, None])))[:, 0]
-    return float(white @ white) / estimate.white_variance
+    present = np.where(record.sampling.present[:, None], columns, 0.0)
+    return np.asarray(whiten_columns(filter_of(record, estimate.ratios), pad_columns(present)))[:, : columns.shape[1]]
