@@ -267,6 +267,12 @@ BY_HAND = [
         [20.0, 0.0, 0.0, 0.0, -5.0],
     ),
     (
+        "saturation",
+        {"share": "1", "limit": "40 deg/h", "lower": ["-50 deg/h"]},
+        {"rate": [x * DEG_H for x in (-60.0, -40.0, 0.0, 39.0, 45.0)]},
+        [10.0, 0.0, 0.0, 0.0, -5.0],
+    ),
+    (
         "bias_readout_code",
         {"cosine": ["3 deg/h", "1 deg/h"], "sine": ["4 deg/h", "2 deg/h"], "period": "80"},
         {"feedback_ramp": [0.0, 10.0, 20.0, 40.0, 80.0]},

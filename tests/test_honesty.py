@@ -178,18 +178,27 @@ def test_soaks_at_one_temperature_each_are_no_runs(rng: np.random.Generator) -> 
     assert "run" not in read([many]).record.signals
 
 
-@pytest.mark.parametrize("told", [pytest.param(True, marks=pytest.mark.long), False])
-def test_of_a_gyro_that_is_turned_over_the_earths_rate_is_told_of(told: bool, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize(
+    ("column", "told"),
+    [
+        pytest.param("acceleration_input", True, marks=pytest.mark.long),
+        ("acceleration_input", False),
+        ("acceleration_x", False),
+    ],
+)
+def test_of_a_gyro_that_is_turned_over_the_earths_rate_is_told_of(
+    column: str, told: bool, rng: np.random.Generator
+) -> None:
     """Six positions, 10 deg/h of the Earth's vertical rate in the output: the reference has it, or there is none."""
     up = np.repeat([1.0, 0.0, -1.0, 0.0, 1.0, -1.0], ROWS // 6)
     rate = 10.0 * up + (np.tile([50.0, -50.0], len(up) // 2) if told else 0.0)
-    columns = {"time": TIME, "acceleration_input": up, "output": rate + 2.0 * up + 0.5 * rng.normal(size=ROWS)}
+    columns = {"time": TIME, column: up, "output": rate + 2.0 * up + 0.5 * rng.normal(size=ROWS)}
     columns |= {"rate": rate / 3600.0} if told else {}
-    units = {n: {"acceleration_input": "g", "rate": "deg/s", "time": "s"}.get(n, "deg/h") for n in columns}
+    units = {n: {column: "g", "rate": "deg/s", "time": "s"}.get(n, "deg/h") for n in columns}
     measured = gm.Campaign(columns, units, {"kind": "rate", "rate_frame": "inertial"})
     model = gm.model_from_effects(["bias", "scale_factor"] if told else ["bias"])
     found = gm.diagnose(measured, model, hold_out=False)
-    assert "bias_acceleration_input" in [c.effect for c in found.causes]
+    assert f"bias_{column}" in [c.effect for c in found.causes]
     assert any("No reference rate is given" in line for line in found.findings) == (not told)
 
 

@@ -296,6 +296,20 @@ def test_a_clipped_output_is_saturation():
     assert told.value == pytest.approx(np.rad2deg(limit), abs=max(5 * told.std, 1e-3))
 
 
+def test_a_range_that_does_not_end_alike_on_both_sides(rng: np.random.Generator):
+    """Fitted as one limit it was 3.5 deg/s wrong on both sides, with an uncertainty of 0.03."""
+    rate = np.repeat([0.0, 60.0, -60.0, 120.0, -120.0, 180.0, -180.0, 230.0, -230.0, 260.0, -260.0, 300.0, -300.0], 40)
+    rate = rate + np.tile(np.linspace(-2.0, 2.0, 40), 13)
+    output = np.clip(rate + 0.3, -252.0, 245.0) + 0.15 * rng.standard_normal(len(rate))
+    columns = {"time": 0.1 * np.arange(len(rate)), "rate": rate, "output": output}
+    campaign = gm.Campaign(columns, {"time": "s", "rate": "deg/s", "output": "deg/s"}, {"kind": "rate"})
+    found = gm.diagnose(campaign, gm.model_from_effects(["bias", "scale_factor"]), hold_out=False)
+    assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["saturation"])
+    told = {p.name: p for p in found.causes[0].parameters}
+    for name, limit in (("limit", 245.0), ("lower", -252.0)):
+        assert abs(told[name].value - limit) < 5.0 * told[name].std < 0.5
+
+
 @pytest.mark.long
 def test_an_output_that_ends_has_its_errors_before_the_end():
     """Bias and scale move the rate at which a converter ends, not what it tells there."""

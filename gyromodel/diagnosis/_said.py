@@ -29,8 +29,8 @@ from gyromodel.signals import Record
 
 # Parts of an interval by which samples may be off a regular grid before they tell a line from its aliases.
 IRREGULAR = 0.01
-# Of a gyro that is turned over these follow the Earth's rate too: its vertical part the first, its northern all.
-UNDER_EARTH = ("bias_acceleration_input", "bias_acceleration_output", "bias_acceleration_spin")
+# Of a gyro that is turned over a bias from one acceleration follows the Earth's rate too, vertical or northern.
+UNDER_EARTH = "bias_acceleration_"
 # Gross errors that are listed by row.
 ROWS_TOLD = 12
 # By how much the lags searched are apart, within which one is known.
@@ -105,7 +105,8 @@ def told_of_cause(steps: Steps, step: Found, extended: Estimate, known: set[str]
             yield f"Angles of {name}, in this order: about {listed(effect.about)}."
         elif isinstance(effect, BiasAccelerationSquared):
             yield f"Coefficients of {name}, in this order: of {listed(effect.products)}."
-    if name in UNDER_EARTH and "rate" not in steps.scanner.record.units:
+    squared = isinstance(step.effect, BiasAccelerationSquared)
+    if name.startswith(UNDER_EARTH) and not squared and "rate" not in steps.scanner.record.units:
         yield (
             "No reference rate is given: where the Earth's is in the output, biases from acceleration hold up to 15.04 "
             "deg/h per g of it, which a column rate in inertial space (rate_frame: inertial) would take out."
@@ -142,13 +143,15 @@ def told_of_walk(steps: Steps, last: Ranking) -> Iterator[str]:
         return log_sum([one + other for one, other in zip(each, own, strict=True)])
 
     walk, nothing = weight(walks), weight(still)
-    effects = [k for k in last.statistic if not (is_driver(k) or is_noise(k) or k == "outliers")]
+    kept = [k for k, score in last.statistic.items() if score < steps.least(last, k)]
+    effects = [k for k in kept if not (is_driver(k) or is_noise(k) or k == "outliers")]
     lead = {k: weight(still, k) - walk for k in effects}
     top = max(lead.values(), default=-np.inf)
     if not (walk > nothing and top > LIKELY and top + walk - nothing > steps.threshold):
         return
     near = {k for k, v in lead.items() if v > top - ALIKE}
-    names = sorted((k for k in near if near.isdisjoint(special_cases(k))), key=lambda k: -lead[k])[:MOST_NAMES]
+    own = (k for k in near if (near - {k}).isdisjoint(special_cases(k)))
+    names = sorted(own, key=lambda k: -lead[k])[:MOST_NAMES]
     yield (
         f"What was taken for a random walk of the bias may as well be {' or '.join(names)} (ln B {top:.1f} against the "
         "walk, which would have to be ruled out): repeat the run, as noise does not come back."

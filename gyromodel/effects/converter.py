@@ -13,8 +13,10 @@ from jaxtyping import Array, Float
 from gyromodel.effects._base import Effect, Signals, parameter, stack
 from gyromodel.effects._shapes import EARTHLY, beyond_earth
 
-# Limits searched, as parts of the largest rate, and different rates that must lie beyond one.
+# Limits searched, as parts of the largest rate, different rates that must lie beyond one, and what part of it the range
+# may have on the other side.
 LOWEST, HIGHEST, LIMITS, FEWEST_BEYOND = 0.2, 0.99, 24, 2
+OTHER_SIDE = (0.8, 0.9, 0.95, 0.98, 1.02, 1.05, 1.1, 1.25)
 # Series over the ramp: how many harmonics, and periods searched as parts of its span. A ramp's ends need not meet:
 # twice the span leaves them free.
 SERIES = (
@@ -28,7 +30,8 @@ SERIES = (
 class Saturation(Effect):
     """output = S₀ max(−ω_max, min(u, ω_max)), u = (I + E + D)(1 + ε): the output ends at the limits of its range.
 
-    The search lets a share of the effect vary to have a linear coefficient; the fit holds it at one.
+    `lower`, where there is one, takes the place of −ω_max. The search lets a share of the effect vary to have a linear
+    coefficient; the fit holds it at one.
     """
 
     id = "saturation"
@@ -42,27 +45,40 @@ class Saturation(Effect):
 
     share: Float[Array, ""] = parameter("1", 1.0, "part of the output that saturates", default=1.0)
     limit: Float[Array, ""] = parameter("deg/s", 100.0, "largest rate that is told", linear=False, default=1.75)
+    lower: Float[Array, " side"] = parameter(
+        "deg/s", 100.0, "lowest rate that is told, where it is another", linear=False, default=()
+    )
 
     def __check_init__(self) -> None:
         if self.limit <= 0:
             raise ValueError("a range ends above zero")
+        if np.size(self.lower) > 1 or np.any(np.asarray(self.lower) >= 0):
+            raise ValueError("lower takes one rate below zero, or none")
 
     def columns(self, signals: Signals) -> Float[Array, "sample coefficient"]:
         """What is told, cut at the limits, less what is told."""
-        return stack(jnp.clip(signals["rate"], -self.limit, self.limit) - signals["rate"])
+        lower = self.lower[0] if self.lower.size else -self.limit
+        return stack(jnp.clip(signals["rate"], lower, self.limit) - signals["rate"])
 
     def settled(self) -> Self:
         """All of the output saturates."""
-        return type(self)(share=jnp.ones(()), limit=self.limit)
+        return type(self)(share=jnp.ones(()), limit=self.limit, lower=self.lower)
 
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
-        """Limits with several rates beyond them."""
+        """Limits with several rates beyond them, of both sides alike and of each side its own."""
         if not beyond_earth(signals):
             return []
-        levels = np.unique(np.round(np.abs(np.asarray(signals["rate"])), 9))
-        limits = levels[-1] * np.linspace(LOWEST, HIGHEST, LIMITS)
-        return [cls(limit=limit) for limit in limits if np.sum(levels > limit) >= FEWEST_BEYOND]
+        levels = np.unique(np.round(np.asarray(signals["rate"]), 9))
+        sizes = np.unique(np.abs(levels))
+        limits = [x for x in sizes[-1] * np.linspace(LOWEST, HIGHEST, LIMITS) if np.sum(sizes > x) >= FEWEST_BEYOND]
+        apart = [
+            cls(limit=limit, lower=jnp.asarray([-part * limit]))
+            for limit in limits
+            for part in OTHER_SIDE
+            if min(np.sum(levels > limit), np.sum(levels < -part * limit)) >= FEWEST_BEYOND
+        ]
+        return [cls(limit=limit) for limit in limits] + apart
 
 
 class Quantisation(Effect):

@@ -35,7 +35,7 @@ class TimeDelay(Effect):
     """I += ω(t − δ) − ω(t): the output is late.
 
     The search lets a share of the effect vary to have a linear coefficient, which for a small delay is −δ dω/dt; the
-    fit holds it at one. Between samples the rate is a cubic through the four around.
+    fit holds it at one. Between samples the rate is a polynomial through the six around.
     """
 
     id = "time_delay"
@@ -236,13 +236,14 @@ def _between(
 def earlier(
     time: Float[Array, " sample"], values: Float[Array, " sample"], delay: Float[Array, ""]
 ) -> Float[Array, " sample"]:
-    """Values a delay before each sample, by the cubic through the four samples around.
+    """Values a delay before each sample, by the polynomial through the six samples around.
 
-    Beyond a stretch's ends it is continued by some steps and then held, for what came before is not known.
+    Through four, a delay of a rate with ten samples a period is a lag besides. Beyond a stretch's ends it is continued
+    by some steps and then held, for what came before is not known.
     """
     clock, first, last = _clock(time)
     beyond = CONTINUED * _usual(time)
-    return _between(4, clock, first, last, values, jnp.clip(clock - delay, clock[first] - beyond, clock[last] + beyond))
+    return _between(6, clock, first, last, values, jnp.clip(clock - delay, clock[first] - beyond, clock[last] + beyond))
 
 
 @jax.jit
