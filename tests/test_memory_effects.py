@@ -12,7 +12,7 @@ from scipy.stats import binom
 
 import gyromodel as gm
 from gyromodel.compensation import compensate
-from gyromodel.diagnosis._variance import steps_of_output, stretch_still, thermometers_still
+from gyromodel.diagnosis._variance import steps_of_output, stretch_still, thermometers_still, without_still
 from gyromodel.effects.memory import BiasThermalHysteresis
 from gyromodel.effects.thermal import BiasTemperatureProduct, BiasTemperatureRate
 from gyromodel.effects.thermometer import TemperatureLag
@@ -366,10 +366,33 @@ def test_a_stretch_that_stands_still_is_said_of(quantum: float, repeats: int, sa
         campaign = gm.Campaign(
             {"time": np.arange(400.0), "output": output}, {"time": "s", "output": "deg/s"}, {"kind": "rate"}
         )
-        sentence = stretch_still(campaign)
-        told += sentence is not None
-        assert quantum or sentence is None or f"0.25 deg/s in data rows 101 to {100 + repeats} of" in sentence
+        rows = stretch_still(campaign)
+        told += rows is not None
+        assert quantum or rows in (None, slice(100, 100 + repeats))
     assert told == logs if said else binom.sf(told - 1, logs, 0.005) > 1e-5
+
+
+@pytest.mark.parametrize(("rate", "value"), [(False, 2.5), (False, 7.5), (True, 2.5)])
+def test_what_a_dead_sensor_tells_is_given_up(rate: bool, value: float, rng: np.random.Generator):
+    """Beside a slope over temperature its value was a step up and one down. At the end of a range it may well stand."""
+    time = 20.0 * np.arange(900)
+    temperature = np.interp(time, [0, 6000, 9000, 18000], [-20.0, 40.0, 40.0, 10.0])
+    output = 3.0 + 0.05 * temperature + 0.2 * rng.standard_normal(900)
+    output[200:260] = value
+    columns = {"time": time, "temperature": temperature, "output": output}
+    units = {"time": "s", "temperature": "degC", "output": "deg/h"}
+    if rate:
+        columns["rate"], units["rate"] = np.zeros(900), "deg/h"
+    campaign = gm.Campaign(columns, units, {"kind": "rate"})
+    kept, told = without_still(campaign)
+    assert told is not None
+    assert f"stands at {value:g} deg/h in data rows 201 to 260 of" in told
+    given_up = value < 5.0 and not rate
+    assert ("given up" in told) == given_up
+    assert np.flatnonzero(np.isnan(kept.columns["output"])).tolist() == [*range(201, 260)] * given_up
+    if given_up:
+        found = gm.diagnose(campaign, gm.model_from_effects(["bias", "bias_temperature"]), hold_out=False)
+        assert (found.verdict, told in found.findings) == ("adequate", True)
 
 
 @pytest.mark.parametrize("steps", [1.0, 2.0, 3.0])

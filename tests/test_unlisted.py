@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 from scipy.stats import binom
 
 import gyromodel as gm
+from gyromodel.diagnosis._ranking import Ranking
 from tests.truth import study
 
 STEP = 15.0
@@ -37,6 +40,14 @@ def leaked(values: np.ndarray, step: float, time_constant: float) -> np.ndarray:
     for i in range(1, len(values)):
         inside[i] = inside[i - 1] + step / time_constant * (values[i - 1] - inside[i - 1])
     return inside
+
+
+@pytest.mark.parametrize(("pair", "told"), [(45.6, "smooth(rate)"), (48.0, "smooth(rate, time)")])
+def test_one_column_will_do_where_two_hardly_lead(pair: float, told: str):
+    """A scale factor that jumps followed "rate and time" by 0.03 nats, and nobody varies time alone."""
+    statistic = {"smooth(rate, time)": pair, "smooth(rate)": 45.58, "smooth(time)": 3.0, "scale_nonlinearity": 41.6}
+    ranking = cast(Ranking, SimpleNamespace(statistic=statistic))
+    assert Ranking.best(ranking, drivers=True) == (told, statistic[told])
 
 
 @pytest.mark.parametrize("leak", [1500.0, *(pytest.param(leak, marks=pytest.mark.long) for leak in (300.0, 500.0))])

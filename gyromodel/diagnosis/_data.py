@@ -14,7 +14,7 @@ from gyromodel.attitude import refuse_navigated, with_reference_rates
 from gyromodel.averages import MAXIMUM_ROWS, MEAN_OF_ATTITUDE, MOST_TURN, as_rate, average, turning
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._readings import Readings, readings_of
-from gyromodel.diagnosis._variance import steps_of_output, stretch_still, thermometers_still
+from gyromodel.diagnosis._variance import steps_of_output, thermometers_still, without_still
 from gyromodel.numerics.stretches import stretches_of
 from gyromodel.platform import GIMBALS, is_platform, vibration_record
 from gyromodel.poses import at_rest
@@ -82,6 +82,7 @@ def _of_gyro(measured: Sequence[Campaign]) -> Data:
     refuse_navigated(measured)
     as_given, measured = measured, [_with_runs(measured[0])] if len(measured) == 1 else measured
     given, of_attitude = zip(*(with_reference_rates(c) for c in measured), strict=True)
+    given, still = zip(*(without_still(c) for c in given), strict=True)
     campaigns = [at_rest(c) for c in given]
     findings = [line for line in of_attitude if line]
     if "run" in measured[0].columns and "run" not in as_given[0].columns:
@@ -113,7 +114,7 @@ def _of_gyro(measured: Sequence[Campaign]) -> Data:
         for g, (c, m) in zip(campaigns, shortened, strict=True)
         if m == 1 and len(c) < len(g)
     ]
-    findings += [line for c in given if (line := stretch_still(c))]
+    findings += [line for line in still if line]
     stepped = tuple(line for c in given if (line := steps_of_output(c)))
     findings += [line for c in given for line in thermometers_still(c)]
     searched = tuple(c for c, _ in shortened)

@@ -12,7 +12,7 @@ import numpy as np
 from gyromodel._checks import thermometers
 from gyromodel.diagnosis._bank import Bank
 from gyromodel.diagnosis._batch import CellResult
-from gyromodel.diagnosis._drivers import RESPONSE_DRIVER
+from gyromodel.diagnosis._drivers import RESPONSE_DRIVER, smooth_columns
 from gyromodel.diagnosis._evidence import SAFE_THRESHOLD, SIZES, log_evidence_at_sizes, log_mean, log_sum
 from gyromodel.diagnosis._lines import lines_of
 from gyromodel.diagnosis._scan import Scanner
@@ -36,6 +36,8 @@ SLOW_IN_TIME = ("bias_drift", "bias_warmup", "bias_step")
 EXEMPT = (*SLOW_IN_TIME, "outliers")
 # A function of time alone must beat a random walk by this much in one run: no real slow noise is exactly a random walk.
 TIME_MARGIN = 15.0
+# Nats that a function of two columns has to lead that of one of them.
+ONE_WILL_DO = 2.0
 # Nats by which a cause that no catalogue lists must do better: it is rarer than one that does.
 UNLISTED = 1.0
 # Part of the largest direction of further columns from which on another counts, beyond the baseline's.
@@ -63,13 +65,17 @@ class Ranking:
     def best(self, *, drivers: bool, but: tuple[str, ...] = ()) -> tuple[str | None, float]:
         """The best unknown driver, or the best named candidate (but some), and its evidence ratio (ln).
 
-        Lines that a response to the motion, linear or not, explains better are the motion's own.
+        Lines that a response to the motion, linear or not, explains better are the motion's own. A function of two
+        columns that hardly leads that of one of them has no need of the other.
         """
         if self.statistic.get(RESPONSE_DRIVER, -np.inf) > self.statistic.get("bias_periodic", -np.inf):
             but = (*but, "bias_periodic")
         mine = {k: v for k, v in self.statistic.items() if is_driver(k) == drivers and k not in but}
         # Of names that are the same on this campaign the first, whatever the rounding.
         top = max(mine, key=lambda k: round(mine[k], 6)) if mine else None
+        if drivers and top and len(columns := smooth_columns(top)) > 1:
+            alone = max((f"smooth({column})" for column in columns), key=lambda k: mine.get(k, -np.inf))
+            top = alone if mine.get(alone, -np.inf) > mine[top] - ONE_WILL_DO else top
         return top, mine[top] if top else -np.inf
 
     @property

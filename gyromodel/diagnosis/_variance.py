@@ -219,23 +219,43 @@ def steps_of_output(campaign: Campaign) -> str | None:
     )
 
 
-def stretch_still(campaign: Campaign) -> str | None:
-    """A sentence where the output repeats one value for longer than its other values make likely."""
-    name = campaign.outputs[0]
-    values = campaign.columns[name]
+def stretch_still(campaign: Campaign) -> slice | None:
+    """Rows in which the output repeats one value for longer than its other values make likely."""
+    values = campaign.columns[campaign.outputs[0]]
     edges = np.flatnonzero(np.concatenate([[True], values[1:] != values[:-1], [True]]))
     longest = int(np.argmax(np.diff(edges)))
-    start, stop = edges[longest : longest + 2]
+    start, stop = map(int, edges[longest : longest + 2])
     repeats = stop - start - 1
     others = (len(values) - len(edges) + 1 - repeats + 1) / len(values)
     # A value of probability p follows itself with p, and the mean over values of p² is what the others show.
     likely = np.log(len(values)) + 0.5 * repeats * np.log(others)
     if repeats < FEWEST_REPEATS or others > MOST_REPEATS or likely > np.log(CHANCE):
         return None
-    return (
-        f"The output stands at {values[start]:.6g} {campaign.units[name]} in data rows {start + 1} to {stop} of "
-        f"{campaign.name}: check whether sensor and logger were alive, as steps at its ends would be theirs."
-    )
+    return slice(start, stop)
+
+
+def without_still(campaign: Campaign) -> tuple[Campaign, str | None]:
+    """The campaign without what it told while its output stood still, and a sentence on that.
+
+    At an end of its range the output may well stand, and in a lock-in band beside a rate; and nothing may be known of
+    an angle or of increments alone: these are kept.
+    """
+    rows = stretch_still(campaign)
+    if rows is None:
+        return campaign, None
+    name = campaign.outputs[0]
+    values, unit = campaign.columns[name], campaign.units[name]
+    told = f"The output stands at {values[rows.start]:.6g} {unit} in data rows {rows.start + 1} to {rows.stop} of "
+    inside = np.nanmin(values) < values[rows.start] < np.nanmax(values)
+    if not inside or "rate" in campaign.columns or campaign.metadata["kind"] != "rate":
+        return campaign, (
+            f"{told}{campaign.name}: check whether sensor and logger were alive, as steps at its ends would be theirs."
+        )
+    values = values.copy()
+    # The first was read while it lived.
+    values[rows.start + 1 : rows.stop] = np.nan
+    told = f"{told}{campaign.name}: given up, as no gyro's noise stands still."
+    return campaign.with_column(name, values, unit), told
 
 
 def thermometers_still(campaign: Campaign) -> list[str]:
