@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from hashlib import sha256
 from pathlib import Path
 
-from gyromodel._console import print_table, progress_bar
+from gyromodel._console import make_folder, print_table, progress_bar
 from gyromodel.batch import (
     Batch,
     Parameter,
@@ -28,7 +28,7 @@ from gyromodel.report import number, with_uncertainty
 def batch_to(archive: str, model: Path, output: Path, diagnosing: bool, workers: int, scheduler: str | None) -> Batch:
     """The archive examined, its table written."""
     start, digest = read_model(model), sha256(model.read_bytes()).hexdigest()
-    output.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(output.parent)
     with progress_bar() as progress:
         return run_batch(
             archive, start, digest, output,
@@ -43,7 +43,7 @@ def units_of(results: Path, output: Path | None) -> tuple[list[Parameter], list[
     if twice := copies(table):
         print(f"gyromodel: the same data as others, and counted once: {', '.join(twice)}", file=sys.stderr)
     if output:
-        output.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(output.parent)
         write_table(pooled_table(table, found), output)
     return found, pooled_effects(table)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gyromodel._checks import CampaignError
-from gyromodel._console import read_campaigns
+from gyromodel._console import make_folder, read_campaigns
 from gyromodel.compensation import ErrorAgainstReference, compensate, reference_error
 from gyromodel.files import write_campaign
 from gyromodel.streaming import Streamed, compensate_file
@@ -35,13 +35,13 @@ def compensate_to(
                 )
 
     if campaign.is_file() and campaign.stat().st_size > LARGE:
-        output.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(output.parent)
         if streamed := compensate_file(campaign, output, calibration, axis, accept):
             return streamed, held
     compensated = compensate(read_campaigns([campaign], axis)[0], calibration)
     error = reference_error(compensated)
     accept(error)
-    output.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(output.parent)
     write_campaign(compensated, output)
     note = str(compensated.metadata.get("rate_estimated_note", ""))
     return Streamed(len(compensated), note, error, compensated.digest()), held

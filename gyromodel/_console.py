@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -66,7 +67,20 @@ def read_campaigns(paths: Sequence[Path], axis: str | None) -> list[Campaign]:
 def prepare_folder(folder: Path, model: Path) -> None:
     """Refuse or make the folder for results before the work, so that a wrong place costs no time."""
     refuse_overwriting(folder / "model.yaml", [model])
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
+
+
+def make_folder(folder: Path) -> None:
+    """Make the folder for results, with those above it.
+
+    Raises:
+        OSError: it cannot be made; the sentence says that it is the output's.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        why = f"no folder for the output can be made there ({os.strerror(error.errno or 0).lower()})"
+        raise OSError(error.errno, why, str(folder)) from error
 
 
 def refuse_suffix(target: Path, suffixes: Sequence[str]) -> None:

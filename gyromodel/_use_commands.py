@@ -11,6 +11,7 @@ import typer
 from gyromodel._atomic import write_text
 from gyromodel._console import (
     json_text,
+    make_folder,
     print_paths,
     read_campaigns,
     refuse_overwriting,
@@ -74,7 +75,7 @@ def sensitivity(
     if output:
         from gyromodel.report import history_figure, tornado_figure
 
-        output.mkdir(parents=True, exist_ok=True)
+        make_folder(output)
         texts = json_text(result), tornado_figure(found), history_figure(found)
         for name, text in zip(SENSITIVITY, texts, strict=True):
             write_text(output / name, text)
@@ -126,7 +127,7 @@ def navigate(
 
     refuse_suffix(output, SUFFIXES)
     navigated = navigate_campaign(read_campaigns([campaign], None)[0])
-    output.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(output.parent)
     write_campaign(navigated, output)
     end = {name: float(navigated.columns[name][-1]) for name in ("latitude", "longitude", "height")}
     if as_json:

@@ -18,6 +18,7 @@ from gyromodel._compiling import keep_compiled, switch_compiler
 from gyromodel._console import (
     interrupts_kept,
     json_text,
+    make_folder,
     prepare_folder,
     print_paths,
     print_table,
@@ -186,7 +187,7 @@ def simulate(
         print(f"gyromodel: {model} states no noise, and none is drawn", file=sys.stderr)
     pattern = read_plan(pattern_file) if plan else read_campaign(pattern_file, measured=False)
     simulated = simulate_campaign(simulated_by, pattern.axis(axis) if axis else pattern, seed)
-    output.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(output.parent)
     write_campaign(simulated, output)
     result = {"campaign": str(output), "rows": len(simulated), "seed": seed, "data_hash": simulated.digest()}
     print(json_text(result) if as_json else f"{len(simulated)} samples in {output}\n", end="")
@@ -225,7 +226,7 @@ def allan(
     as_json: AsJson = False,
 ) -> None:
     """Allan deviation and noise coefficients with intervals, of a gyro at rest."""
-    output.mkdir(parents=True, exist_ok=True)
+    make_folder(output)
     from gyromodel.noise_analysis import analyse_noise
     from gyromodel.report import deviation_figure, noise_rows
 
@@ -257,7 +258,7 @@ def vibration(
     with progress_bar() as progress:
         test = vibration_test(measured, progress)
     result, figures = test.to_dict(), vibration_figures(test)
-    output.mkdir(parents=True, exist_ok=True)
+    make_folder(output)
     write_text(output / "vibration.json", json_text(result))
     for name, figure in figures.items():
         write_text(output / f"{name}.svg", figure)

@@ -638,7 +638,7 @@ def test_missing_files_are_named(tmp_path: Path, run: Run, command: str):
 def test_an_output_folder_that_is_a_file_is_refused_before_the_work(bench: Path, run: Run):
     (bench / "taken").write_text("", encoding="utf-8")
     outcome = run("fit", bench / "nothing.csv", "--model", bench / "simulation.yaml", "-o", bench / "taken")
-    assert "taken" in refusal(outcome)
+    assert "taken: no folder for the output can be made there (file exists)" in refusal(outcome)
 
 
 def test_inputs_are_never_overwritten(bench: Path, run: Run):

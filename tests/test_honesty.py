@@ -157,9 +157,14 @@ def test_a_bias_that_differs_behind_gaps_is_a_turn_on_bias(rng: np.random.Genera
     columns = {"time": time, "temperature": 25 + 15 * np.sin(time / 1500.0), "output": level + rng.normal(size=ROWS)}
     units = {"time": "s", "temperature": "degC", "output": "deg/h"}
     measured = gm.Campaign(columns, units, {"kind": "rate"})
-    found = gm.diagnose(measured, gm.model_from_effects(["bias", "bias_temperature"]), hold_out=False)
+    found = gm.diagnose(measured, gm.model_from_effects(["bias", "bias_temperature"]))
     assert (found.verdict, [c.effect for c in found.causes]) == ("named", ["bias_turn_on"])
+    assert any("No run tells another's offset" in line for line in found.findings)
     assert any("each stretch between gaps counts as one" in line for line in found.findings)
+    flat = gm.diagnose(
+        measured.with_column("output", rng.normal(size=ROWS), "deg/h"), gm.model_from_effects(["bias"]), hold_out=False
+    )
+    assert not any("each stretch between gaps counts as one" in line for line in flat.findings)
     for p, truth in zip(found.causes[0].parameters, (3.0, -2.0, 2.0, 4.0), strict=False):
         assert p.value == pytest.approx(truth, abs=5 * p.std)
 

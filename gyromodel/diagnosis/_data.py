@@ -27,6 +27,11 @@ MEAN_OF_POSE = 1.0
 MOST_ROWS, MOST_VALUES = 40_000, 320_000
 # Part of its range within which a column stands still in a stretch; stretches that may be runs, fewer than are dwells.
 STILL, MOST_STRETCHES = 0.1, 11
+# Told where it matters.
+NO_RUNS = (
+    "There is no column run: each stretch between gaps counts as one. A model with bias_turn_on is applied to files "
+    "that have the column."
+)
 
 
 @dataclass(frozen=True)
@@ -86,10 +91,7 @@ def _of_gyro(measured: Sequence[Campaign]) -> Data:
     campaigns = [at_rest(c) for c in given]
     findings = [line for line in of_attitude if line]
     if "run" in measured[0].columns and "run" not in as_given[0].columns:
-        findings.append(
-            "There is no column run: each stretch between gaps counts as one. A model with bias_turn_on is applied to "
-            "files that have the column."
-        )
+        findings.append(NO_RUNS)
     findings += [
         f"{len(np.unique(posed.columns['position']))} static poses were found in {c.name}; {len(c) - len(posed)} rows "
         "in motion were left out."

@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 from gyromodel.campaign import Campaign
 from gyromodel.diagnosis._account import as_added, evidence_at_sizes, more_needed, p_value_of, rounds_of
 from gyromodel.diagnosis._conclusion import Conclusion, conclude
+from gyromodel.diagnosis._data import NO_RUNS
 from gyromodel.diagnosis._folds import gain_of
 from gyromodel.diagnosis._gain import not_measured
 from gyromodel.diagnosis._intervals import CLEARER, COUNTED, HALF, over_intervals
@@ -23,6 +24,7 @@ from gyromodel.model import GyroModel
 from gyromodel.units import factor, from_internal
 
 FEWEST_DRAWS = 200
+UNSEEN_OFFSETS = "No run tells another's offset: errors on data not used hold those of the runs left out."
 
 
 def diagnose(
@@ -107,6 +109,11 @@ def _result(found: Searched, told: Conclusion, gain: Gain, hold_out: bool) -> Di
     if steps_searched and not told.coarse:
         sizes["quantisation"] = readings.least(found.record, extended), readings.unit
     names = [*scanner.bank.names(), *(name for r in rankings for name in r.tangents)]
+    findings = [*found.findings, *judgement.findings]
+    if "bias_turn_on" not in {*extended.model.labels, *judgement.credible_set}:
+        findings = [line for line in findings if line != NO_RUNS]
+    elif hold_out and "fifths" not in gain.scheme and any(c.effect == "bias_turn_on" for c in judgement.causes):
+        findings.append(UNSEEN_OFFSETS)
     return Diagnosis(
         verdict=judgement.verdict,
         causes=judgement.causes,
@@ -122,7 +129,7 @@ def _result(found: Searched, told: Conclusion, gain: Gain, hold_out: bool) -> Di
         rounds=rounds_of(session, selection, scale, hold_out),
         credible_set=judgement.credible_set,
         unexplained=judgement.unexplained,
-        findings=(*found.findings, *judgement.findings),
+        findings=tuple(findings),
         threshold=session.threshold + more_needed(rankings[0], selection.path),
         threshold_kind="calibrated" if calibrated else "safe",
         p_value=p_value_of(selection, found.nulls) if calibrated else None,
