@@ -241,8 +241,16 @@ class Steps:
         return self.scanner.without(np.flatnonzero(ended), self.scanner.only_cells) if ended.any() else self.scanner
 
     def add(self, found: Sequence[Found], step: Found) -> tuple[Found, Estimate | None]:
-        """A further step and the fit with it, without the samples that the effect as fitted does not know."""
+        """A further step and the fit with it, without the samples that the effect as fitted does not know.
+
+        A wider form takes its place where that fits better by more than its parameters cost.
+        """
         after = self.fit(standing([*found, step]))
+        if after is not None and step.effect is not None and (wider := step.effect.wider()) is not None:
+            other = replace(step, effect=wider)
+            fitted = self.fit(standing([*found, other]))
+            if fitted is not None and quality(fitted) > quality(after) + EXCHANGE:
+                step, after = other, fitted
         if after is None or step.effect is None or step.effect.label not in after.model.labels:
             return step, after
         rows = not_known(self.scanner, after.model.effects[after.model.labels.index(step.effect.label)])

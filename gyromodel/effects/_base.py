@@ -150,6 +150,10 @@ class Effect(eqx.Module):
         """This effect, which continues others, at an amplitude; ValueError beyond what it can be."""
         return replace(self, **{self.amplitude_name(): amplitude})
 
+    def wider(self) -> Self | None:
+        """The form with more parameters, if any, that is fitted once this one has been found."""
+        return None
+
     @property
     def structure(self) -> str:
         """What sets searched forms with equally many parameters apart, as no two shapes of one form are."""

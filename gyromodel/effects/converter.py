@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Self
 
 import equinox as eqx
@@ -13,10 +14,8 @@ from jaxtyping import Array, Float
 from gyromodel.effects._base import Effect, Signals, parameter, stack
 from gyromodel.effects._shapes import EARTHLY, beyond_earth
 
-# Limits searched, as parts of the largest rate, different rates that must lie beyond one, and what part of it the range
-# may have on the other side.
+# Limits searched, as parts of the largest rate, and different rates that must lie beyond one.
 LOWEST, HIGHEST, LIMITS, FEWEST_BEYOND = 0.2, 0.99, 24, 2
-OTHER_SIDE = (0.8, 0.9, 0.95, 0.98, 1.02, 1.05, 1.1, 1.25)
 # Series over the ramp: how many harmonics, and periods searched as parts of its span. A ramp's ends need not meet:
 # twice the span leaves them free.
 SERIES = (
@@ -64,21 +63,18 @@ class Saturation(Effect):
         """All of the output saturates."""
         return type(self)(share=jnp.ones(()), limit=self.limit, lower=self.lower)
 
+    def wider(self) -> Self | None:
+        """With a limit of its own below."""
+        return None if self.lower.size else replace(self, lower=-self.limit[None])
+
     @classmethod
     def candidates(cls, signals: Signals) -> list[Self]:
-        """Limits with several rates beyond them, of both sides alike and of each side its own."""
+        """Limits with several rates beyond them."""
         if not beyond_earth(signals):
             return []
-        levels = np.unique(np.round(np.asarray(signals["rate"]), 9))
-        sizes = np.unique(np.abs(levels))
-        limits = [x for x in sizes[-1] * np.linspace(LOWEST, HIGHEST, LIMITS) if np.sum(sizes > x) >= FEWEST_BEYOND]
-        apart = [
-            cls(limit=limit, lower=jnp.asarray([-part * limit]))
-            for limit in limits
-            for part in OTHER_SIDE
-            if min(np.sum(levels > limit), np.sum(levels < -part * limit)) >= FEWEST_BEYOND
-        ]
-        return [cls(limit=limit) for limit in limits] + apart
+        levels = np.unique(np.round(np.abs(np.asarray(signals["rate"])), 9))
+        limits = levels[-1] * np.linspace(LOWEST, HIGHEST, LIMITS)
+        return [cls(limit=limit) for limit in limits if np.sum(levels > limit) >= FEWEST_BEYOND]
 
 
 class Quantisation(Effect):
