@@ -14,6 +14,7 @@ from gyromodel.effects.drivers import Bias, BiasDrift
 from gyromodel.effects.scale import ScaleFactor
 from gyromodel.effects.thermal import BiasTemperature, BiasTemperatureCurve, BiasWarmup
 from gyromodel.estimate import Estimate, EstimateError, _fit, fit, fit_record, two_stage, with_noise_intervals
+from gyromodel.estimate._estimate import noise_table
 from gyromodel.model import GyroModel, ModelError, model_from_effects
 from gyromodel.noise import NoiseRatios, markov_sum
 from gyromodel.numerics.least_squares import Solution
@@ -504,3 +505,12 @@ def test_colour_that_so_few_samples_cannot_show_has_no_upper_end(rows: int, rng:
     ends = [found.noise_table()[name]["hi"] for name in ("noise_flicker", "noise_random_walk")]
     assert np.isfinite(ends).all() == (rows > 40)
     assert np.isfinite(found.noise_table()["noise_white"]["hi"])
+
+
+def test_an_interval_of_noise_holds_its_value():
+    """The likeliest Markov noise of a misfit lay beyond the cells around it, and its interval did not hold it."""
+    model = GyroModel((Bias(),), {"noise_white": jnp.asarray(1e-5), "noise_flicker": jnp.asarray(1e-7)})
+    rows = noise_table(model, {"noise_white": (2e-5, 3e-5), "noise_flicker": (0.0, 5e-8)})
+    for row in rows.values():
+        assert float(row["lo"]) <= float(row["value"]) <= float(row["hi"])
+        assert float(row["lo"]) < float(row["hi"])

@@ -128,13 +128,17 @@ def calibration_of(model: GyroModel, covariance: np.ndarray, record: Record, deg
 
 
 def noise_table(model: GyroModel, intervals: Mapping[str, tuple[float, float]]) -> dict[str, dict[str, float | str]]:
-    """A model's noise coefficients with their intervals, in reporting units; a stated one is its own interval."""
+    """A model's noise coefficients with their intervals, in reporting units; a stated one is its own interval.
+
+    The likeliest noise may lie beyond what most cells around it have: an interval then ends there.
+    """
     rows: dict[str, dict[str, float | str]] = {}
     for name, coefficient in model.noise.items():
         value = float(coefficient)
         unit = noise_units(model.noise_of)[name]
         scale = factor(internal_unit(unit), unit)
         low, high = intervals.get(name, (value, value))
+        low, high = min(low, value), max(high, value)
         rows[name] = {"value": value * scale, "lo": low * scale, "hi": high * scale, "unit": unit}
     if (level := model.level) is not None:
         low, high = intervals.get("noise_heteroscedastic", (level.ratio, level.ratio))
