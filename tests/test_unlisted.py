@@ -354,3 +354,25 @@ def test_two_steps_in_time_may_be_what_follows_the_sign_of_a_rate():
     found = gm.diagnose(measured, gm.model_from_effects(["bias"]), hold_out=False)
     assert (found.verdict, [c.effect for c in found.causes]) == ("ambiguous", ["bias_step"])
     assert "smooth(d(temperature)/dt)" in found.credible_set
+
+
+@pytest.mark.long
+def test_clocks_that_run_apart_are_a_delay_that_grows(rng: np.random.Generator):
+    """150 ppm apart, 90 ms in ten minutes: it was one delay of 45 ms or a lag, in noise of 8 times the true one."""
+    time = 0.5 * np.arange(1200)
+
+    def rate(t: np.ndarray) -> np.ndarray:
+        return sum(
+            (a * np.sin(2 * np.pi * f * t + p) for a, f, p in ((10, 0.02, 0), (6, 0.05, 1), (3, 0.12, 2))), 0 * t
+        )
+
+    output = rate(time - 150e-6 * time) + 0.05 + 0.02 * rng.standard_normal(len(time))
+    columns = {"time": time, "rate": rate(time), "output": output}
+    measured = gm.Campaign(columns, {"time": "s", "rate": "deg/s", "output": "deg/s"}, {"kind": "rate"})
+    found = gm.diagnose(measured, gm.model_from_effects(["bias", "scale_factor"]), hold_out=False)
+    assert found.verdict == "unknown"
+    assert found.driver is not None
+    assert found.driver.column == "d(rate)/dt and time"
+    assert any("the clocks of gyro and reference may run apart" in line for line in found.findings)
+    assert found.next_test is not None
+    assert "clocks" in found.next_test

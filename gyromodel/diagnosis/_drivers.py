@@ -16,6 +16,8 @@ from gyromodel.declarations import BEHIND, RATE_OF, measured
 from gyromodel.signals import Record
 
 RESPONSE_DRIVER, RECOVERY_DRIVER = f"smooth({RATE_OF.format('rate')})", f"smooth({BEHIND.format('rate')})"
+# A delay that grows.
+CLOCK_DRIVER = f"smooth({RATE_OF.format('rate')}, time)"
 # A current of which this part follows the output's noise is the output, if it is so many over the root of the samples:
 # four standard errors, as neighbouring second differences of noise are alike. How many times their median are no jump.
 ALIKE, CERTAIN, NO_JUMP = 0.1, 5.6, 4.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gyromodel.declarations import BEHIND, EARLIER, RATE_OF, measured
-from gyromodel.diagnosis._drivers import smooth_columns
+from gyromodel.diagnosis._drivers import CLOCK_DRIVER, smooth_columns
 from gyromodel.diagnosis._result import Cause
 from gyromodel.model import effect_class
 from gyromodel.signals import Record
@@ -30,6 +30,8 @@ def test_of_driver(driver: str) -> str:
     bases, forms = zip(*(measured(c) for c in smooth_columns(driver)), strict=True)
     if bases == ("time",):
         return "Repeat the run from power-on, everything held: noise does not come back."
+    if driver == CLOCK_DRIVER:
+        return "Compare the clocks of gyro and reference at the beginning and the end, or record both by one clock."
     if any(base.startswith("acceleration_") for base in bases):
         between = " and ".join(bases)
         return f"Repeat the run with attitudes between those of this one, so that {between} takes more values."
@@ -38,7 +40,8 @@ def test_of_driver(driver: str) -> str:
         how = "in ramps of several speeds up and down"
     elif {EARLIER, BEHIND} & set(forms):
         how = "in steps held until nothing changes any more"
-    return f"Vary {' and '.join(bases)} alone, {how}, everything else held, and repeat the run."
+    varied = [base for base in bases if base != "time"]
+    return f"Vary {' and '.join(varied)} alone, {how}, everything else held, and repeat the run."
 
 
 def test_of_names(names: list[str], record: Record, cause: Cause) -> str:

@@ -9,7 +9,7 @@ from scipy.stats import binom
 
 from gyromodel._checks import listed, thermometers
 from gyromodel.campaign import Campaign
-from gyromodel.diagnosis._drivers import RECOVERY_DRIVER, driver_names, kind_of, proportion
+from gyromodel.diagnosis._drivers import CLOCK_DRIVER, RECOVERY_DRIVER, driver_names, kind_of, proportion
 from gyromodel.diagnosis._evidence import log_sum
 from gyromodel.diagnosis._lines import lines_of
 from gyromodel.diagnosis._ranking import Ranking, is_driver, is_noise, special_cases
@@ -206,7 +206,9 @@ def _after_changes(steps: Steps, selection: Selection) -> Iterator[str]:
 
 
 def told_of_driver(scanner: Scanner, selection: Selection, driver: str) -> Iterator[str]:
-    """The time constant of what follows the rate through a lag."""
+    """A delay that grows, and the time constant of what follows the rate through a lag."""
+    if driver == CLOCK_DRIVER:
+        yield "A delay that grows with time does so: the clocks of gyro and reference may run apart."
     if driver != RECOVERY_DRIVER:
         return
     along = scanner.bank.blocks[int(np.asarray(selection.last.best_form(driver)[0]))].along

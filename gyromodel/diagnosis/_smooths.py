@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from gyromodel.declarations import EARLIER, RATE_OF
-from gyromodel.diagnosis._drivers import RECOVERY_DRIVER, RESPONSE_DRIVER, driver_names, kind_of
+from gyromodel.diagnosis._drivers import CLOCK_DRIVER, RECOVERY_DRIVER, RESPONSE_DRIVER, driver_names, kind_of
 from gyromodel.effects._shapes import beyond_earth
 from gyromodel.effects.dynamics import resolved
 from gyromodel.signals import Record, thermometer_rate
@@ -110,9 +110,9 @@ def _paired(record: Record, names: Sequence[str]) -> Iterator[Smooth]:
 def products(record: Record, known: Container[str]) -> Iterator[Smooth]:
     """Name, values of the first column, and product of each pair of columns, less those known.
 
-    The rate is paired with its own rate, too. All pairs as smooth functions would be too many. A product is what an
-    effect becomes whose size follows another column, such as a mass unbalance that changes with temperature. Columns of
-    one kind have effects of their own.
+    The rate is paired with its own rate, too, and that with time, as clocks that run apart make a delay grow. All pairs
+    as smooth functions would be too many. A product is what an effect becomes whose size follows another column, such
+    as a mass unbalance that changes with temperature. Columns of one kind have effects of their own.
     """
     names = [n for n in _ordered(record) if n != "campaign"] if record.domain == "gyro" else []
     for a, b in combinations(names, 2):
@@ -123,8 +123,9 @@ def products(record: Record, known: Container[str]) -> Iterator[Smooth]:
             x, y = (np.asarray(record.signals[n]) for n in (a, b))
             yield f"smooth({a}, {b})", x, _product(record, x, y)
     if "rate" in names and (runs := _turning(record)):
-        rate = np.asarray(record.signals["rate"])
-        yield f"smooth(rate, {RATE_OF.format('rate')})", rate, _product(record, rate, _acceleration(record, runs))
+        (rate, time), along = (np.asarray(record.signals[n]) for n in ("rate", "time")), _acceleration(record, runs)
+        yield f"smooth(rate, {RATE_OF.format('rate')})", rate, _product(record, rate, along)
+        yield CLOCK_DRIVER, along, _product(record, along, time)
 
 
 def _product(record: Record, *columns: np.ndarray) -> np.ndarray:
