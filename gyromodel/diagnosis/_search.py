@@ -115,6 +115,7 @@ def _rounds(steps: Steps, progress: Progress, avoid: str = "", begin: str = "") 
         if not steps.keeps(estimate, step, after):
             lost.add(name)
             continue
+        step, after = steps.widened(path, step, after)
         if progress:
             progress(f"found {name}", min(0.25 + 0.06 * len(path), 0.6))
         path.append(step)

@@ -241,16 +241,8 @@ class Steps:
         return self.scanner.without(np.flatnonzero(ended), self.scanner.only_cells) if ended.any() else self.scanner
 
     def add(self, found: Sequence[Found], step: Found) -> tuple[Found, Estimate | None]:
-        """A further step and the fit with it, without the samples that the effect as fitted does not know.
-
-        A wider form takes its place where that fits better by more than its parameters cost.
-        """
+        """A further step and the fit with it, without the samples that the effect as fitted does not know."""
         after = self.fit(standing([*found, step]))
-        if after is not None and step.effect is not None and (wider := step.effect.wider()) is not None:
-            other = replace(step, effect=wider)
-            fitted = self.fit(standing([*found, other]))
-            if fitted is not None and quality(fitted) > quality(after) + EXCHANGE:
-                step, after = other, fitted
         if after is None or step.effect is None or step.effect.label not in after.model.labels:
             return step, after
         rows = not_known(self.scanner, after.model.effects[after.model.labels.index(step.effect.label)])
@@ -273,6 +265,15 @@ class Steps:
         except EstimateError:
             return True
         return bool(_profiled(after) - _profiled(before) >= KEPT * step.ranking.statistic[step.name])
+
+    def widened(self, found: Sequence[Found], step: Found, after: Estimate) -> tuple[Found, Estimate]:
+        """A step that is kept and its fit, in a wider form where that fits better by more than its parameters cost."""
+        wider = step.effect.wider() if step.effect is not None else None
+        if wider is None:
+            return step, after
+        other = replace(step, effect=wider)
+        fitted = self.fit(standing([*found, other]))
+        return (other, fitted) if fitted is not None and quality(fitted) > quality(after) + EXCHANGE else (step, after)
 
     def all_but(self, found: Sequence[Found], i: int) -> tuple[Estimate, Ranking] | None:
         """The fit with everything found except item i, and all candidates beside it; none where that fit fails."""
