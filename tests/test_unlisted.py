@@ -42,10 +42,13 @@ def leaked(values: np.ndarray, step: float, time_constant: float) -> np.ndarray:
     return inside
 
 
-@pytest.mark.parametrize(("pair", "told"), [(45.6, "smooth(rate)"), (48.0, "smooth(rate, time)")])
-def test_one_column_will_do_where_two_hardly_lead(pair: float, told: str):
-    """A scale factor that jumps followed "rate and time" by 0.03 nats, and nobody varies time alone."""
-    statistic = {"smooth(rate, time)": pair, "smooth(rate)": 45.58, "smooth(time)": 3.0, "scale_nonlinearity": 41.6}
+@pytest.mark.parametrize(
+    ("pair", "alone", "told"),
+    [(45.6, 45.58, "smooth(rate)"), (48.0, 45.58, "smooth(rate, time)"), (4.6, 3.2, "smooth(rate, time)")],
+)
+def test_one_column_will_do_where_two_hardly_lead(pair: float, alone: float, told: str):
+    """A scale factor that jumps followed "rate and time" by 0.03 nats; what only both tell is not lost."""
+    statistic = {"smooth(rate, time)": pair, "smooth(rate)": alone, "smooth(time)": 3.0, "scale_nonlinearity": 41.6}
     ranking = cast(Ranking, SimpleNamespace(statistic=statistic))
     assert Ranking.best(ranking, drivers=True) == (told, statistic[told])
 

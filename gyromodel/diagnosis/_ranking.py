@@ -75,7 +75,9 @@ class Ranking:
         top = max(mine, key=lambda k: round(mine[k], 6)) if mine else None
         if drivers and top and len(columns := smooth_columns(top)) > 1:
             alone = max((f"smooth({column})" for column in columns), key=lambda k: mine.get(k, -np.inf))
-            top = alone if mine.get(alone, -np.inf) > mine[top] - ONE_WILL_DO else top
+            # Where it would not be told of by itself, both are.
+            least = max(mine[top] - ONE_WILL_DO, SAFE_THRESHOLD + UNLISTED)
+            top = alone if mine.get(alone, -np.inf) > least else top
         return top, mine[top] if top else -np.inf
 
     @property
