@@ -5,7 +5,7 @@ Arrays are padded to a few fixed lengths, so that compiled functions serve every
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from gyromodel._output_rate import rate_output
 from gyromodel.campaign import Campaign
 from gyromodel.effects._base import Domain
 from gyromodel.numerics.state_space import Sampling
-from gyromodel.numerics.stretches import derivative_by_stretch, stretches_of, values_by_stretch
+from gyromodel.numerics.stretches import derivative_by_stretch, smooth_by_stretch, stretches_of
 from gyromodel.units import UnitError, convertible, factor, quantity
 
 # A step this many times the median within runs, where a run begins, is time in which the gyro was off.
@@ -32,6 +32,8 @@ JITTER = 0.05
 # A column missing in more than this share of the rows is not searched; rows without one of the others are left out, up
 # to a share of them for all columns together.
 MOST_MISSING, MOST_LEFT_OUT = 0.2, 0.5
+# Whose squares heat a thermometer.
+RATES = ("rate", "rate_x", "rate_y", "rate_z")
 # Stretches that are held out one by one, and may be power cycles.
 FEWEST_BLOCKS, MOST_BLOCKS = 4, 60
 
@@ -280,27 +282,52 @@ def time_since_power_on(campaign: Campaign) -> float:
 
 def thermometer_rate(record: Record, temperature: np.ndarray) -> np.ndarray:
     """The signal temperature_rate that a record would have with another temperature, one value a row."""
-    return _by_run(record, temperature, derivative_by_stretch)
+    time, rate = np.asarray(record.signals["time"])[: record.rows], np.empty(record.rows)
+    for here in _runs(record):
+        rate[here] = derivative_by_stretch(time[here], temperature[here])
+    return rate
+
+
+def smooth_thermometer(record: Record, temperature: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A temperature less its noise, and its rate of change, one value a row.
+
+    A spline, and what the square of the rates explains behind leaks: heat of what turns or holds has a corner wherever
+    they change. The rest is its mean where the spline varies less than the readings about it: these may shape it alone.
+    """
+    rates = [np.asarray(record.signals[n])[: record.rows] for n in RATES if n in record.signals]
+    heat = np.sum(np.square(rates), axis=0) if rates else np.zeros(record.rows)
+    time, smooth, slope = (
+        np.asarray(record.signals["time"])[: record.rows],
+        np.empty(record.rows),
+        np.empty(record.rows),
+    )
+    for here in _runs(record):
+        smooth[here], slope[here] = smooth_by_stretch(time[here], temperature[here], heat[here])
+    return smooth, slope
 
 
 def with_smooth_thermometers(record: Record) -> Record:
-    """The record with every thermometer as the spline has it whose slope its rate is.
-
-    Where the spline varies less than the readings about it, it may be shaped by them alone: their mean takes its place.
-    """
+    """The record with every thermometer less its noise, and the rate of change of that; see `smooth_thermometer`."""
     signals = dict(record.signals)
     for name in thermometers(signals):
-        measured = np.asarray(signals[name])
-        smooth = _by_run(record, measured[: record.rows], values_by_stretch)
-        signals[name] = jnp.asarray(np.pad(smooth, (0, len(measured) - record.rows), mode="edge"))
+        signals |= laid_under(signals, name, *smooth_thermometer(record, np.asarray(signals[name])[: record.rows]))
     return record._replace(signals=signals)
 
 
-def _by_run(record: Record, values: np.ndarray, of: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
-    """What `of` makes of the times and values of each run, one value a row."""
-    time = np.asarray(record.signals["time"])[: record.rows]
+def laid_under(
+    signals: dict[str, Float[Array, " sample"]], name: str, values: np.ndarray, rate: np.ndarray
+) -> dict[str, Float[Array, " sample"]]:
+    """Values of a thermometer and of its rate of change as the signals that there are of it, padded as these."""
+    found = {name: values, f"{name}_rate": rate}
+    return {
+        k: jnp.asarray(np.pad(v, (0, len(signals[k]) - len(v)), mode="edge")) for k, v in found.items() if k in signals
+    }
+
+
+def _runs(record: Record) -> list[np.ndarray]:
+    """The rows of each run."""
     runs = np.cumsum(np.asarray(record.sampling.restart)[: record.rows])
-    return np.concatenate([of(time[runs == i], values[runs == i]) for i in np.unique(runs)])
+    return [np.flatnonzero(runs == i) for i in np.unique(runs)]
 
 
 def with_columns_known(record: Record) -> tuple[Record, list[str]]:

@@ -127,7 +127,8 @@ def _counts(found: Searched) -> Estimate | None:
     if band:
         found.findings.append(band.told(found.session.record))
     # Where a band of the faster half is left besides, neighbours fall apart otherwise than a count's errors do.
-    if stepped is None or (band and band.high > 0.25 / found.session.record.interval):
+    apart = band and band.high > 0.25 / found.session.record.interval
+    if stepped is None or stepped.statistic < found.left or apart:
         return None
     found.noise.append(stepped)
     size = stepped.parameters[0].value

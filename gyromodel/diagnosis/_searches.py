@@ -29,7 +29,7 @@ from gyromodel.diagnosis._session import (
     over_weighted,
     without_axis,
 )
-from gyromodel.diagnosis._thermometers import within_thermometers
+from gyromodel.diagnosis._thermometers import left_by_thermometers, smoothed, within_thermometers
 from gyromodel.diagnosis._variance import Growth, follow, growing_noise
 from gyromodel.diagnosis._verdict import FAINT
 from gyromodel.effects.converter import Quantisation
@@ -77,6 +77,7 @@ class Searched:
         grows: what the noise level follows, samples being weighted so.
         following: a sentence, where what follows itself there is no noise.
         instead: what a warm-up behind gaps may be instead, if one was searched.
+        left: evidence (nats) that noise of thermometers may make that were smoothed; 0 as they were read.
     """
 
     data: Data
@@ -95,6 +96,7 @@ class Searched:
     grows: Growth | None = None
     following: str | None = None
     instead: str = ""
+    left: float = 0.0
 
     @property
     def of_gyro(self) -> bool:
@@ -111,13 +113,16 @@ def searched(measured: list[Campaign], given: GyroModel, calibrate: int, seed: i
     time_on = found.data.time_on
     if time_on is not None and (off := over_power_cycles(found.session, found.selection, time_on, found.model, say)):
         found.session, found.selection, found.instead = off
-    if found.of_gyro and (smoothed := over_smooth_thermometers(found.session, found.selection, found.model, say)):
-        found.session, found.selection = smoothed
+    if found.of_gyro and (smooth := over_smooth_thermometers(found.session, found.selection, found.model, say)):
+        found.session, found.selection = smooth
         found.findings.append(SMOOTHED)
     if not found.rounding.saw_tooth:
         _weighted(found, say)
     found.selection, not_named = within_thermometers(found.session.steps, found.selection, found.record)
     found.findings += [not_named] if not_named else []
+    if smoothed(found.session.record, found.record):
+        last = found.selection.estimate
+        found.left = left_by_thermometers(last, found.record, last)
     if found.of_gyro:
         _over_hops(found)
     elif found.selection.found and (failed := unexplained_axes(found.selection.estimate)):
@@ -251,9 +256,10 @@ def _over_hops(found: Searched) -> None:
     free = with_noise_estimated(selection.estimate)
     if free is None or "noise_telegraph" in found.model.noise or not _like_hops(selection, free):
         return
-    found.hops = telegraph(session.baseline, free, found.data.unit)
-    if found.hops is None:
+    hops = telegraph(session.baseline, free, found.data.unit)
+    if hops is None or hops.statistic < found.left:
         return
+    found.hops = hops
     found.noise.append(found.hops)
     found.findings.append("Fits take hops of the bias for noise of a like variance and correlation.")
     start = with_noise_estimated(session.baseline) or session.baseline

@@ -19,6 +19,7 @@ from gyromodel.diagnosis._scan import Scanner
 from gyromodel.diagnosis._search import Progress, search, steadied
 from gyromodel.diagnosis._selection import Selection, significant_driver
 from gyromodel.diagnosis._steps import EXCHANGE, NoisePath, Steps, standing
+from gyromodel.diagnosis._thermometers import left_by_thermometers
 from gyromodel.diagnosis._unseen import fitted
 from gyromodel.diagnosis._variance import Growth, with_variance
 from gyromodel.estimate import Estimate, EstimateError, Unrounded, fit_record
@@ -222,9 +223,12 @@ def over_smooth_thermometers(
     except EstimateError:
         return None
     other = smooth.run(say)
-    some = other.found or selection.found
+    some = other.found or selection.found or selection.driver
     # What only followed a column was found too, if not named; what smooth records leave to follow one is no gain.
     ahead = EXCHANGE + max(selection.followed - other.followed, 0.0)
+    if not other.found and other.driver is None:
+        # What smooth records leave of the simulation alone passes for what follows a column.
+        ahead = max(EXCHANGE, ahead - left_by_thermometers(other.estimate, session.record, other.estimate))
     better = some and smooth.steps.fits_better(other.found, selection.found, ahead, session.steps)
     return (smooth, other) if better else None
 

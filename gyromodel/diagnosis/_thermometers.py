@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 
 from gyromodel._checks import listed, thermometers
@@ -14,7 +13,8 @@ from gyromodel.diagnosis._ranking import is_driver, is_noise
 from gyromodel.diagnosis._selection import Selection
 from gyromodel.diagnosis._steps import Found, Steps, quality, rows_of
 from gyromodel.estimate import Estimate, filter_of, whiten_columns
-from gyromodel.signals import Record, thermometer_rate, with_smooth_thermometers
+from gyromodel.noise import NoiseRatios
+from gyromodel.signals import Record, laid_under, smooth_thermometer, thermometer_rate, with_smooth_thermometers
 
 # What follows a temperature's rate of change, or how far one temperature is behind another.
 LATE = (
@@ -45,7 +45,8 @@ def within_thermometers(steps: Steps, selection: Selection, as_read: Record) -> 
         The selection, and what is to be said of names that it no longer has.
     """
     found, first = selection.found, selection.first
-    thermal = selection.driver is not None and _thermal(selection.driver)
+    heated = smoothed(steps.scanner.record, as_read)
+    thermal = selection.driver is not None and _thermal(selection.driver, heated)
     if steps.scanner.record.domain != "gyro" or not (thermal or any(f.name in LATE for f in found)):
         return selection, ""
     others = [f for f in found if f.name not in LATE]
@@ -60,19 +61,31 @@ def within_thermometers(steps: Steps, selection: Selection, as_read: Record) -> 
         if alone is not None:
             bases.append((alone, [strongest, *(f for f in others if f.name != name)]))
     for base, kept in bases:
-        if len(kept) < len(found) or thermal:
+        if thermal or {f.name for f in kept} != {f.name for f in found}:
             left = left_by_thermometers(base, as_read, selection.estimate)
-            fewer = _only(steps, selection, kept, left) if left >= SHOWS else None
+            fewer = _only(steps, selection, kept, left, heated) if left >= SHOWS else None
             if fewer is not None:
                 return fewer
     return selection, ""
 
 
-def _thermal(driver: str) -> bool:
-    return bool(thermometers(base_of(column)[0] for column in smooth_columns(driver)))
+def _thermal(driver: str, heated: bool) -> bool:
+    """Whether a driver is of a temperature, or of the rate where that is in part known by its heat."""
+    columns = {base_of(column)[0] for column in smooth_columns(driver)}
+    return bool(thermometers(columns)) or (heated and "rate" in columns)
 
 
-def _only(steps: Steps, selection: Selection, kept: list[Found], left: float) -> tuple[Selection, str] | None:
+def smoothed(record: Record, as_read: Record) -> bool:
+    """Whether a record's thermometers are others than were read."""
+    return any(
+        not np.array_equal(*(np.asarray(r.signals[name])[: as_read.rows] for r in (record, as_read)), equal_nan=True)
+        for name in thermometers(as_read.signals)
+    )
+
+
+def _only(
+    steps: Steps, selection: Selection, kept: list[Found], left: float, heated: bool
+) -> tuple[Selection, str] | None:
     """A selection of a part of what was found, each ranked beside those before it, and what is said of the rest.
 
     None where the rest explains more than is left (nats), or there is no fit.
@@ -92,14 +105,14 @@ def _only(steps: Steps, selection: Selection, kept: list[Found], left: float) ->
     held = replace(steps, noise=(selection.estimate.ratios,))
     given_up = Found("", None, rows_of([*selection.found, *path]), selection.first)
     fewer, whole = held.fit([*path, given_up]), held.fit([*selection.found, given_up])
-    thermal = selection.driver if selection.driver and _thermal(selection.driver) else ""
+    thermal = selection.driver if selection.driver and _thermal(selection.driver, heated) else ""
     followed = selection.followed if thermal else 0.0
     if fewer is None or whole is None or quality(whole) - quality(fewer) + followed > left:
         return None
     last = steps.rank(estimates[-1], path)
     drivers = {k: v for k, v in last.statistic.items() if is_driver(k)}
     shows = {k: v for k, v in drivers.items() if v >= steps.least(last, k)}
-    if any(_thermal(k) and v > left for k, v in shows.items()):
+    if any(_thermal(k, heated) and v > left for k, v in shows.items()):
         return None
     more = selection.remains
     if last.statistic.get(more, -np.inf) < (left if more in LATE else steps.least(last, more) if more else np.inf):
@@ -119,7 +132,7 @@ def _only(steps: Steps, selection: Selection, kept: list[Found], left: float) ->
         tuple(path),
         last,
         tuple(estimates),
-        max((k for k in shows if not _thermal(k)), key=lambda k: shows[k], default=None),
+        max((k for k in shows if not _thermal(k, heated)), key=lambda k: shows[k], default=None),
         remains=more,
         unresolved=selection.unresolved,
     ), said
@@ -129,7 +142,7 @@ def left_by_thermometers(estimate: Estimate, as_read: Record, noise: Estimate) -
     """The evidence (nats) of about what noise of thermometers leaves of a fit, in the noise of another fit.
 
     From one more reading of smooth temperatures, with as much noise as their thermometers have, and what it changes in
-    their rates of change. Temperatures themselves are searched smooth where their noise shows.
+    their rates of change; and in themselves where the fit has them smooth.
 
     Args:
         estimate: the fit.
@@ -138,15 +151,17 @@ def left_by_thermometers(estimate: Estimate, as_read: Record, noise: Estimate) -
     """
     smooth, rng, rows = with_smooth_thermometers(as_read), np.random.default_rng(0), as_read.rows
     before, again = estimate.record.signals, dict(estimate.record.signals)
+    own = smoothed(estimate.record, as_read)
     for name in thermometers(as_read.signals):
-        if f"{name}_rate" in before:
-            true, read = (np.asarray(r.signals[name])[:rows] for r in (smooth, as_read))
-            other = true + _noise_of(read, true, as_read.run[:rows]) * rng.standard_normal(rows)
-            rate = thermometer_rate(as_read, other)
-            again[f"{name}_rate"] = jnp.asarray(np.pad(rate, (0, len(before[name]) - rows), mode="edge"))
+        true, read, used = (np.asarray(s[name])[:rows] for s in (smooth.signals, as_read.signals, before))
+        other = true + _noise_of(read, true, as_read.run[:rows]) * rng.standard_normal(rows)
+        new = smooth_thermometer(as_read, other) if own else (used, thermometer_rate(as_read, other))
+        again |= laid_under(before, name, *new)
     change = np.asarray(estimate.model.predict(again) - estimate.model.predict(before))
     present = np.asarray(estimate.record.sampling.present)
-    whitened = whiten_columns(filter_of(estimate.record, noise.ratios), np.where(present, change, 0.0)[:, None])
+    # The correlated noise of a fit of smooth temperatures is in part what is left of theirs.
+    ratios = NoiseRatios(np.zeros(()), np.zeros(())) if own else noise.ratios
+    whitened = whiten_columns(filter_of(estimate.record, ratios), np.where(present, change, 0.0)[:, None])
     each = np.asarray(whitened)[present]
     return 0.5 * len(each) * float(np.log1p(np.mean(each**2) / noise.white_variance))
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
+from gyromodel.numerics.leaks import behind_leaks
 from gyromodel.numerics.smoothing import smooth_derivative, smooth_values
 
 # A step this many times the median one separates stretches of a record.
@@ -26,25 +25,29 @@ def derivative_by_stretch(time: np.ndarray, values: np.ndarray) -> np.ndarray:
     if good.sum() < 2:
         return rate
     rate[good] = np.gradient(values[good], time[good])
-    return _by_stretch(time, values, smooth_derivative, rate)
+    for here in _known(time, values):
+        rate[here] = smooth_derivative(time[here], values[here])
+    return rate
 
 
-def values_by_stretch(time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Smoothed values, each stretch by itself; their mean where the curve varies less than they do about it."""
+def smooth_by_stretch(time: np.ndarray, values: np.ndarray, drive: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Smoothed values and their derivative, each stretch by itself: a spline, and what a drive explains behind leaks.
 
-    def of(time: np.ndarray, own: np.ndarray) -> np.ndarray:
-        smooth = smooth_values(time, own)
-        return smooth if np.var(smooth) > np.var(own - smooth) else np.full(len(own), own.mean())
+    The spline is its mean where it varies less than the values do about it.
+    """
+    smooth, rate = values.copy(), derivative_by_stretch(time, values)
+    for here in _known(time, values):
+        driven, flow = behind_leaks(time[here], values[here], drive[here])
+        rest = values[here] - driven
+        curve = smooth_values(time[here], rest)
+        smooth[here] = driven + (curve if np.var(curve) > np.var(rest - curve) else rest.mean())
+        if driven.any():
+            rate[here] = flow + smooth_derivative(time[here], rest)
+    return smooth, rate
 
-    return _by_stretch(time, values, of, values.copy())
 
-
-def _by_stretch(
-    time: np.ndarray, values: np.ndarray, of: Callable[[np.ndarray, np.ndarray], np.ndarray], into: np.ndarray
-) -> np.ndarray:
-    """What `of` makes of each stretch of two known values or more, put into an array."""
+def _known(time: np.ndarray, values: np.ndarray) -> list[np.ndarray]:
+    """The known samples of each stretch that has two or more."""
     known = np.flatnonzero(np.isfinite(values))
-    for here in np.split(known, np.flatnonzero(np.diff(stretches_of(time)[known])) + 1):
-        if len(here) > 1:
-            into[here] = of(time[here], values[here])
-    return into
+    each = np.split(known, np.flatnonzero(np.diff(stretches_of(time)[known])) + 1)
+    return [here for here in each if len(here) > 1]
