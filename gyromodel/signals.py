@@ -296,11 +296,8 @@ def smooth_thermometer(record: Record, temperature: np.ndarray) -> tuple[np.ndar
     """
     rates = [np.asarray(record.signals[n])[: record.rows] for n in RATES if n in record.signals]
     heat = np.sum(np.square(rates), axis=0) if rates else np.zeros(record.rows)
-    time, smooth, slope = (
-        np.asarray(record.signals["time"])[: record.rows],
-        np.empty(record.rows),
-        np.empty(record.rows),
-    )
+    time = np.asarray(record.signals["time"])[: record.rows]
+    smooth, slope = np.empty((2, record.rows))
     for here in _runs(record):
         smooth[here], slope[here] = smooth_by_stretch(time[here], temperature[here], heat[here])
     return smooth, slope

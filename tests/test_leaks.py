@@ -78,7 +78,15 @@ def test_what_follows_no_drive_has_none_of_it(rng: np.random.Generator):
     assert binom.sf(told - 1, 60, 0.02) > 1e-5
 
 
-def test_no_drive_leaves_a_record_as_it_is():
-    values = np.sin(TIME / 300.0)
-    for drive in (np.ones(len(TIME)), np.full(len(TIME), np.nan)):
-        assert not any(part.any() for part in behind_leaks(TIME, values, drive))
+def test_no_drive_leaves_a_record_as_it_is(rng: np.random.Generator):
+    values, missing = np.sin(TIME / 300.0), np.full(len(TIME), np.nan)
+    for of, drive in ((values, np.ones(len(TIME))), (values, missing), (np.ones(len(TIME)), dwells(rng))):
+        assert not any(part.any() for part in behind_leaks(TIME, of, drive))
+
+
+def test_a_record_without_noise_stays_itself(rng: np.random.Generator):
+    power = dwells(rng)
+    warm, rise = heated(power)
+    smooth, rate = smooth_by_stretch(TIME, warm, power)
+    assert smooth == pytest.approx(warm, abs=0.02 * np.std(warm))
+    assert np.std(rate - rise) < 0.1 * np.std(rise)

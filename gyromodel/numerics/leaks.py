@@ -24,7 +24,7 @@ def behind_leaks(
     """
     nothing = np.zeros(len(time)), np.zeros(len(time))
     known = np.isfinite(drive)
-    if len(time) < FEWEST or known.mean() < 1.0 - MISSING or np.ptp(drive[known]) == 0:
+    if len(time) < FEWEST or known.mean() < 1.0 - MISSING or np.ptp(drive[known]) == 0 or np.ptp(values) == 0:
         return nothing
     flow = np.interp(time, time[known], drive[known] / np.max(np.abs(drive[known])))
     step = np.diff(time)

@@ -76,8 +76,8 @@ def shares_beside_smooth(
         left = _left(bands, penalty, knots.values)
         shares = np.linalg.lstsq(left[:, 1:], left[:, 0], rcond=COLLINEAR)[0]
     before, after = (np.sum(rest**2) for rest in (left[:, 0], left[:, 0] - left[:, 1:] @ shares))
-    shows = 0.5 * len(own) * np.log(before / after) > 0.5 * len(shares) * np.log(len(own)) + CORNERS
-    return shares if shows else np.zeros(len(shares))
+    least = 0.5 * len(shares) * np.log(len(own)) + CORNERS
+    return shares if before > after * np.exp(2.0 * least / len(own)) else np.zeros(len(shares))
 
 
 def smoothing_bandwidth(time: Float[np.ndarray, " sample"], values: Float[np.ndarray, " sample"]) -> float:
