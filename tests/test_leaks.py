@@ -88,5 +88,5 @@ def test_a_record_without_noise_stays_itself(rng: np.random.Generator):
     power = dwells(rng)
     warm, rise = heated(power)
     smooth, rate = smooth_by_stretch(TIME, warm, power)
-    assert smooth == pytest.approx(warm, abs=0.02 * np.std(warm))
+    assert smooth == pytest.approx(warm, abs=0.02 * float(np.std(warm)))
     assert np.std(rate - rise) < 0.1 * np.std(rise)
